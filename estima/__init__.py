@@ -19,7 +19,7 @@ import importlib
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, overload
+from typing import TYPE_CHECKING, Any, TypedDict, Unpack, overload
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -212,9 +212,9 @@ def run(*given: Any, estimator: str | Estimator | None = None) -> Run:
         f"estima.run makes one run; use estima.sweep for repeats={experiment.repeats}",
     )
     if not (estimator is None or isinstance(estimator, str)):
-        experiment = experiment.using(estimator)
+        experiment = experiment.with_estimator_object(estimator)
     if recording is not None:
-        experiment = experiment.over(recording)
+        experiment = experiment.with_recording(recording)
     found: list[tuple[Recording, Estimate, Estimate | None]] = []
     rows = evaluate(
         experiment,
@@ -299,17 +299,32 @@ def sweep(*overrides: str, name: str | None = None) -> pd.DataFrame:
     return collect(folder)
 
 
+class Layout(TypedDict, total=False):
+    """How `plot` lays out its panels.
+
+    Attributes
+    ----------
+    row, col
+        One row, one column of panels for each value of this column.
+    size
+        `screen` (the default), or `column` or `page` of a paper.
+    pool
+        Average over other settings that differ too, rather than refuse it.
+    """
+
+    row: str
+    col: str
+    size: str
+    pool: bool
+
+
 def plot(
     table: pd.DataFrame,
     x: str,
     y: str = "answer_ate_rmse_m",
     by: str | Sequence[str] | None = None,
     path: str | Path | None = None,
-    *,
-    row: str | None = None,
-    col: str | None = None,
-    size: str = "screen",
-    pool: bool = False,
+    **layout: Unpack[Layout],
 ) -> Figure:
     """Draw a column of a sweep against another one: means over recordings, with 95 % intervals.
 
@@ -323,12 +338,8 @@ def plot(
         One line for each value of this column, or for each combination of several.
     path
         File to write: .png, .pdf or .svg.
-    row, col
-        One row, one column of panels for each value of this column.
-    size
-        `screen`, or `column` or `page` of a paper.
-    pool
-        Average over other settings that differ too, rather than refuse it.
+    layout
+        `row`, `col`, `size` and `pool`, see `Layout`.
 
     Raises
     ------
@@ -353,7 +364,7 @@ def plot(
             f"the table has no column {column}; estima.plot takes what estima.sweep returned",
         )
     rows = table[table["status"] != Outcome.FAILED]
-    figure = sweep_figure(rows, x, y, by, row=row, col=col, size=size, pool=pool)
+    figure = sweep_figure(rows, x, y, by, **layout)
     return _saved(figure, path)
 
 

@@ -1,1 +1,1 @@
-"""Localization methods: one a file, each reads Frames and answers with Beliefs."""
+"""Localization methods, one per file: each reads Frames and returns Beliefs."""

@@ -164,7 +164,7 @@ class Estimator(Protocol):
         ...
 
     def step(self, frame: Frame) -> Belief:
-        """Take in one Frame and answer with the belief after it."""
+        """Process one Frame and return the belief after it."""
         ...
 
 
@@ -225,7 +225,7 @@ def run(
     return journal.estimate()
 
 
-def run_to_the_end(
+def run_and_finish(
     estimator: Estimator,
     recording: Recording,
     prior: Prior,
@@ -239,13 +239,13 @@ def run_to_the_end(
     """
     begun = processor_s()
     online = run(estimator, recording, prior, rng, keep, on_step)
-    revised = revised_by(estimator, 1)
+    revised = finish(estimator, 1)
     own_s = processor_s() - begun
     spent_s = getattr(estimator, "program_seconds", own_s)  # without the transport to it
-    return answers_of([online], revised, spent_s)[0]
+    return share_processor_time([online], revised, spent_s)[0]
 
 
-def revised_by(estimator: Any, n_robots: int) -> Sequence[Estimate | None]:
+def finish(estimator: Any, n_robots: int) -> Sequence[Estimate | None]:
     """Estimate of each robot that `finish` or `finish_team` gives, or None."""
     if n_robots == 1 and hasattr(estimator, "finish"):
         return [estimator.finish()]
@@ -255,10 +255,10 @@ def revised_by(estimator: Any, n_robots: int) -> Sequence[Estimate | None]:
     return paths
 
 
-def answers_of(
+def share_processor_time(
     online: Sequence[Estimate], revised: Sequence[Estimate | None], spent_s: float
 ) -> list[Answer]:
-    """Answer of each robot; they share the processor time by their Frames."""
+    """Results of each robot; processor time is divided in proportion to their Frames."""
     answers: list[Answer] = []
     n_frames = sum(len(own.stamps) for own in online)
     for own, path in zip(online, revised, strict=True):

@@ -20,7 +20,7 @@ _SMALL_ANGLE_RAD = 1e-4
 
 @dataclass(frozen=True)
 class Gaussian:
-    """A pose (3,), m, m, rad, and its covariance (3, 3); or a motion and its."""
+    """A pose (3,), m, m, rad, and its covariance (3, 3); or a motion and its covariance."""
 
     mean: Array
     covariance: Array
@@ -32,7 +32,7 @@ class Gaussian:
         covariance += by_motion @ motion.covariance @ by_motion.T
         return Gaussian(mean, covariance)
 
-    def with_measured(self, other: Gaussian) -> Gaussian:
+    def fuse(self, other: Gaussian) -> Gaussian:
         """Fuse with an independent measurement of the same pose; the headings are near."""
         gain = np.linalg.solve(self.covariance + other.covariance, self.covariance).T
         off = other.mean - self.mean
@@ -40,7 +40,7 @@ class Gaussian:
         covariance = gain @ other.covariance
         return Gaussian(self.mean + gain @ off, (covariance + covariance.T) / 2.0)
 
-    def seen_from(self, T_base_sensor: Array) -> tuple[Gaussian, Array]:
+    def in_sensor(self, T_base_sensor: Array) -> tuple[Gaussian, Array]:
         """Return the motion of a sensor that sits at this pose on the moving body.
 
         Returns
@@ -144,7 +144,7 @@ def update(
     return mean + gain @ innovation, (after + after.T) / 2.0
 
 
-def stacked(beliefs: Sequence[Gaussian]) -> tuple[Array, Array]:
+def stack(beliefs: Sequence[Gaussian]) -> tuple[Array, Array]:
     """Means (K, 3) and covariances (K, 3, 3) of K poses or motions."""
     means, covariances = [each.mean for each in beliefs], [each.covariance for each in beliefs]
     return np.array(means).reshape(-1, 3), np.array(covariances).reshape(-1, 3, 3)
@@ -156,7 +156,7 @@ def root(covariance: Array) -> Array:
     return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 
 
-def rotated(covariance: Array, angle_rad: float) -> Array:
+def rotate(covariance: Array, angle_rad: float) -> Array:
     """Covariance (3, 3) of a pose in axes from which its own are turned by the angle."""
     cos, sin = math.cos(angle_rad), math.sin(angle_rad)
     R = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])

@@ -17,7 +17,7 @@ Scheme = Literal["systematic", "stratified", "residual", "multinomial"]
 SCHEMES: tuple[Scheme, ...] = ("systematic", "stratified", "residual", "multinomial")
 
 
-def underflowed(log_weights: ArrayLike) -> bool:
+def have_underflowed(log_weights: ArrayLike) -> bool:
     """Whether no particle has any weight left: all are -inf, or some are NaN or +inf."""
     return not bool(np.isfinite(np.max(np.asarray(log_weights, dtype=np.float64))))
 
@@ -29,7 +29,7 @@ def normalize(log_weights: ArrayLike) -> Array:
     [0.5, 0.5]
     """
     logs = np.asarray(log_weights, dtype=np.float64)
-    if underflowed(logs):
+    if have_underflowed(logs):
         return np.full(len(logs), 1.0 / len(logs))
     weights: Array = np.exp(logs - np.max(logs))
     weights /= weights.sum()
@@ -82,7 +82,7 @@ def resample(
     raise InputError(f"resampling scheme must be one of {', '.join(SCHEMES)}, got {scheme!r}")
 
 
-def in_place(indices: Ints, n_particles: int) -> Ints:
+def keep_survivors(indices: Ints, n_particles: int) -> Ints:
     """The same particles in an order that moves few of them: survivors keep their own slot.
 
     Parameters

@@ -13,12 +13,12 @@ from estimators.base import (
     Estimate,
     Journal,
     Prior,
-    answers_of,
-    revised_by,
-    run_to_the_end,
+    finish,
+    run_and_finish,
+    share_processor_time,
     walk,
 )
-from estimators.gaussian import Gaussian, stacked
+from estimators.gaussian import Gaussian, stack
 from estimators.landmarks.sightings import dead_reckoning
 from sim.compiled import processor_s
 from sim.errors import require, required
@@ -90,7 +90,7 @@ def run_team(
     tell = None if on_step is None else lambda _: on_step(next(count))
     if communication.kind == "never":
         return [
-            run_to_the_end(make(), recording, prior, rng(number), on_step=tell)
+            run_and_finish(make(), recording, prior, rng(number), on_step=tell)
             for number, (recording, prior) in enumerate(zip(team.robots, priors, strict=True))
         ]
     begun, n = processor_s(), len(team)
@@ -117,9 +117,9 @@ def run_team(
             for each in zip(online, team.robots, priors, late, strict=True)
         ]
     else:
-        paths = [revised_by(each, n) for each in filters]
+        paths = [finish(each, n) for each in filters]
         revised = paths[0] if len(filters) == 1 else [own[k] for k, own in enumerate(paths)]
-    return answers_of(online, revised, processor_s() - begun)
+    return share_processor_time(online, revised, processor_s() - begun)
 
 
 def _heard(
@@ -165,5 +165,5 @@ def _late(
         for motion in motions[answered + 1 : row + 1]:
             belief = belief.then(motion)
         beliefs.append(belief)
-    means, covariances = stacked(beliefs)
+    means, covariances = stack(beliefs)
     return dataclasses.replace(online, means=means, covariances=covariances, status="ok")

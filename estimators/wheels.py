@@ -175,7 +175,7 @@ class GainedMotion:
             self.travel_m + motion.travel_m,
         )
 
-    def applied(self, pose: Array, P: Array, own: slice, gains: slice) -> Array:
+    def apply(self, pose: Array, P: Array, own: slice, gains: slice) -> Array:
         """Pose (3,) after the motion; the joint covariance P (N, N) is changed in place."""
         mean, by_pose, by_motion = compose(pose, self.motion.mean)
         by_gains = by_motion @ self.by_gains

@@ -19,7 +19,7 @@ from experiments.judging.claims_file import (
     write_verdicts,
 )
 from experiments.judging.folders import code_folder, findings
-from experiments.judging.logs import missing
+from experiments.judging.logs import why_missing
 from experiments.judging.results import Profile, Results
 from experiments.judging.sentences import Conclusion, conclude
 from experiments.report.page import write_report
@@ -58,7 +58,7 @@ def reproduce(*, full: bool = False, only: str | None = None) -> None:
     lines = []
     for paper in _chosen(only):
         begun = time.monotonic()
-        if paper in LOGS and (why := missing()):
+        if paper in LOGS and (why := why_missing()):
             print(f"{paper}: left out, {why}", file=sys.stderr)
             continue
         conclusions = reproduce_paper(paper, profile)
@@ -98,7 +98,7 @@ def redraw(only: str | None = None) -> None:
         if paper in LOGS and only is None and not any((place / "arrays").glob(f"{paper}_*.npz")):
             print(f"{paper}: left out, what it draws of the logs is not here", file=sys.stderr)
             continue
-        with made.as_found():
+        with made.blaming_files():
             _draw(made)
         print(f"{paper}: {time.monotonic() - begun:.0f} s", file=sys.stderr)
 

@@ -13,7 +13,7 @@ from sim.errors import InputError, require
 def require_file(path: Path) -> None:
     """Refuse what is not a file: a folder, or a pipe or device, which could be read without end.
 
-    What is not there is left to the reader.
+    A missing file is left for the reader to report.
     """
     with suppress(OSError, ValueError):
         mode = path.stat().st_mode

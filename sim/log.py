@@ -10,7 +10,7 @@ import numpy as np
 
 from sim.arrays import Array, Ints, Values
 from sim.errors import InputError, require, required
-from sim.sensors.base import Reading, Schema, Sensor, parted
+from sim.sensors.base import Reading, Schema, Sensor, split_schema
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class Log:
         InputError
             If they do not fit the schema.
         """
-        schema, _ = parted(sensor.schema)
+        schema, _ = split_schema(sensor.schema)
         if set(values) != set(schema):
             kind = type(sensor).__name__
             raise InputError(f"a {kind} has the fields {[*schema]}, got {[*values]}")
@@ -81,7 +81,7 @@ class Log:
         """The splits; InputError if no field is ragged."""
         return required(self.splits, "a log without ragged fields has no splits")
 
-    def taken(self, rows: Ints, stamps: Array) -> Log:
+    def select(self, rows: Ints, stamps: Array) -> Log:
         """Log of these readings, at other stamps; none of its fields may be ragged."""
         values = {name: array[rows] for name, array in self.values.items()}
         return dataclasses.replace(self, stamps=stamps, values=values)
@@ -126,7 +126,7 @@ class Log:
             kind.check(self.values[name], n_rows if kind.ragged else n, f"{where}.{name}")
 
 
-def joined(schema: Schema, stamps: Array, readings: Sequence[Reading], where: str) -> Log:
+def log_of_readings(schema: Schema, stamps: Array, readings: Sequence[Reading], where: str) -> Log:
     """Log of single readings.
 
     Raises
@@ -135,7 +135,7 @@ def joined(schema: Schema, stamps: Array, readings: Sequence[Reading], where: st
         If they do not fit the schema.
     """
     values = {
-        name: field.joined([reading[name] for reading in readings], f"{where}.{name}")
+        name: field.stack([reading[name] for reading in readings], f"{where}.{name}")
         for name, field in schema.items()
     }
     ragged = [name for name, field in schema.items() if field.ragged]

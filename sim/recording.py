@@ -22,7 +22,7 @@ import numpy as np
 from sim.arrays import Array, Ints, Values
 from sim.errors import InputError, require, required
 from sim.files import write_whole
-from sim.log import CommandLog, Log, WheelLog, joined
+from sim.log import CommandLog, Log, WheelLog, log_of_readings
 from sim.npz import UNREADABLE, read_arrays
 from sim.options import build
 from sim.recording_check import check_recording
@@ -31,17 +31,31 @@ from sim.sensors.base import (
     Reading,
     Sensor,
     Sensors,
-    parted,
     schema_from_meta,
     sensor_of,
     sensor_settings,
     sensors_from_meta,
+    split_schema,
 )
 from sim.worlds.world import World
 
 __all__ = [
-    "CommandLog", "Frame", "Log", "Recording", "Truth", "WheelLog", "arrays_of", "assembled",
-    "blamed", "described", "digest_of", "joined", "load", "load_robots", "save", "write_arrays",
+    "CommandLog",
+    "Frame",
+    "Log",
+    "Recording",
+    "Truth",
+    "WheelLog",
+    "arrays_of",
+    "describe",
+    "digest_of",
+    "load",
+    "load_robots",
+    "log_of_readings",
+    "naming_file",
+    "recording_from_arrays",
+    "save",
+    "write_arrays",
 ]  # fmt: skip
 FORMAT_VERSION = 2
 REMEDY = "delete it and record again"
@@ -231,7 +245,7 @@ class Recording:
     @property
     def checksum(self) -> str:
         """SHA-256 over all the recording holds, as hex."""
-        return digest_of(arrays_of(self), described(self))
+        return digest_of(arrays_of(self), describe(self))
 
     def cut(self, n_frames: int) -> Recording:
         """The same recording, ended after `n_frames` Frames (the logs keep their tails)."""
@@ -253,7 +267,7 @@ def save(recording: Recording, path: Path, *, durable: bool = True) -> str:
     InputError
         If it cannot be written (full disk, no permission).
     """
-    return write_arrays(path, arrays_of(recording), described(recording), durable=durable)
+    return write_arrays(path, arrays_of(recording), describe(recording), durable=durable)
 
 
 def write_arrays(
@@ -287,21 +301,21 @@ def load_robots(path: Path) -> tuple[Recording, ...]:
         path.suffix == ".npz" or zipfile.is_zipfile(path),
         f"{path}: not a recording; make one of a log with `estima convert`",
     )
-    with blamed(path):
+    with naming_file(path):
         stored, meta = checked_arrays(path)
         if "team" not in meta:
-            return (assembled(stored, meta),)
+            return (recording_from_arrays(stored, meta),)
         parts = meta["team"]
         require(isinstance(parts, list), "it does not say what its robots are")
         own = [_below(stored, str(number)) for number in range(len(parts))]
         others = len(stored) - sum(map(len, own))
         require(others == 0, f"{others} arrays belong to none of its robots")
-        return tuple(map(assembled, own, parts))
+        return tuple(map(recording_from_arrays, own, parts))
 
 
 @contextmanager
-def blamed(path: Path) -> Iterator[None]:
-    """Turn what a file may be wrong in into one line that names it, and the remedy."""
+def naming_file(path: Path) -> Iterator[None]:
+    """Turn errors in a file's content into one line that names the file and the remedy."""
     try:
         yield
     except KeyError as error:
@@ -367,7 +381,7 @@ def arrays_of(recording: Recording) -> dict[str, Values]:
     return arrays
 
 
-def described(recording: Recording) -> dict[str, Any]:
+def describe(recording: Recording) -> dict[str, Any]:
     """What a recording holds besides arrays, as plain values."""
     robot = build(RobotGeometry, dataclasses.asdict(recording.robot), "robot")
     truth = recording.truth.readings if recording.truth else {}
@@ -400,7 +414,7 @@ def digest_of(arrays: dict[str, Values], meta: dict[str, Any]) -> str:
     return digest.hexdigest()
 
 
-def assembled(stored: dict[str, Values], meta: dict[str, Any]) -> Recording:
+def recording_from_arrays(stored: dict[str, Values], meta: dict[str, Any]) -> Recording:
     """Recording of its arrays and plain values, checked."""
 
     def part(prefix: str) -> dict[str, Values]:
@@ -412,7 +426,7 @@ def assembled(stored: dict[str, Values], meta: dict[str, Any]) -> Recording:
     unknown = sorted(set(schemas) - set(meta["sensors"]))
     require(not unknown, f"readings of sensors that it does not describe: {unknown}")
     for name, schema in schemas.items():
-        seen, hidden_fields = parted(schema)
+        seen, hidden_fields = split_schema(schema)
         where = f"logs.{name}"
         logs[name] = Log(
             seen,

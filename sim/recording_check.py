@@ -7,7 +7,7 @@ import numpy as np
 
 from sim.arrays import Values
 from sim.errors import InputError, require
-from sim.sensors.base import RecordedSensor, parted
+from sim.sensors.base import RecordedSensor, split_schema
 
 LARGEST = 1e12  # s, m: nothing that is recorded is beyond
 
@@ -38,7 +38,7 @@ def check_recording(recording: Any) -> None:
     for name, log in recording.logs.items():
         _check_stamps(log.stamps, f"{name}.stamps", least=0)
         sensor = recording.sensors[name]
-        expected, _ = parted(sensor.schema)
+        expected, _ = split_schema(sensor.schema)
         require(
             isinstance(sensor, RecordedSensor) or dict(log.schema) == dict(expected),
             f"the readings of {name} are not those of its settings: they hold {_said(log.schema)}, "

@@ -18,12 +18,12 @@ import numpy as np
 from sim import se2
 from sim.arrays import Array, Values
 from sim.errors import require
-from sim.recording import CommandLog, Log, Recording, Truth, WheelLog, joined
+from sim.recording import CommandLog, Log, Recording, Truth, WheelLog, log_of_readings
 from sim.robot.base import TICK_S, TICKS_PER_S, Robot
 from sim.robot.collisions import Collisions, half_footprint_m, overlaps
 from sim.robot.kinematic import KinematicBody
 from sim.routes.feedback import Feedback, Onboard, feedback_of
-from sim.sensors.base import Rays, Reading, Sensor, Sensors, View, parted
+from sim.sensors.base import Rays, Reading, Sensor, Sensors, View, split_schema
 from sim.sensors.firing import Firing, periods, probes
 from sim.sensors.rays import AmongRobots, BulletRays, ExactRays
 from sim.team import Team
@@ -247,7 +247,7 @@ def _bodies_of(
 
 
 class _Drive:
-    """One robot under way."""
+    """The simulation loop of one robot."""
 
     def __init__(
         self,
@@ -337,8 +337,8 @@ def _log(
 ) -> tuple[Log, dict[str, Values]]:
     """Log of a sensor, and what its schema marks as truth."""
     schema = sensor.schema
-    log = joined(schema, stamps, readings, f"sensors.{name}")
-    seen, hidden = parted(schema)
+    log = log_of_readings(schema, stamps, readings, f"sensors.{name}")
+    seen, hidden = split_schema(schema)
     return (
         dataclasses.replace(log, schema=seen, values={key: log[key] for key in seen}),
         {key: log[key] for key in hidden},

@@ -18,10 +18,10 @@ from sim.recording import (
     Frame,
     Recording,
     arrays_of,
-    blamed,
-    described,
+    describe,
     digest_of,
     load_robots,
+    naming_file,
     write_arrays,
 )
 from sim.sensors import RobotCamera
@@ -134,13 +134,13 @@ def save(team: Team, path: Path) -> str:
 def _parts(team: Team) -> tuple[dict[str, Values], dict[str, Any]]:
     """Every array of a team under the name it is saved by, and plain values."""
     if len(team) == 1:
-        return arrays_of(team.robots[0]), described(team.robots[0])
+        return arrays_of(team.robots[0]), describe(team.robots[0])
     arrays = {
         f"{number}.{name}": values
         for number, recording in enumerate(team.robots)
         for name, values in arrays_of(recording).items()
     }
-    return arrays, {"format": FORMAT_VERSION, "team": [described(robot) for robot in team.robots]}
+    return arrays, {"format": FORMAT_VERSION, "team": [describe(robot) for robot in team.robots]}
 
 
 def load(path: Path) -> Team:
@@ -152,7 +152,7 @@ def load(path: Path) -> Team:
         If the file is missing, altered, or not a recording.
     """
     robots = load_robots(path)
-    with blamed(path):
+    with naming_file(path):
         return Team(robots)
 
 

@@ -41,9 +41,15 @@ from scipy.linalg import cho_factor, cho_solve
 
 from estimators.base import Belief, Estimate, Prior
 from estimators.gaussian import STILL, Gaussian, between, wrap
-from estimators.graph.landmark_drive import FLOOR, LandmarkDrive, loosened, observed, revised
-from estimators.graph.least_squares import LEAST_INFORMATION, camera_whitening, residuals_of
-from estimators.graph.matrices import inverse, times, transposed, whitening_of
+from estimators.graph.landmark_drive import (
+    FLOOR,
+    LandmarkDrive,
+    loosen,
+    read_observations,
+    solve_drives,
+)
+from estimators.graph.least_squares import MIN_INFORMATION, camera_whitening, residuals_of
+from estimators.graph.matrices import inverse, times, transpose, whitening_of
 from estimators.landmarks.joint import JointGaussian
 from estimators.landmarks.stereo import StereoModel, StereoOptions
 from estimators.laser.icp import PreparedScan
@@ -119,12 +125,12 @@ class FixedLag(FixedLagOptions):
     def step(self, frame: Frame) -> Belief:
         """Roll by the wheels; at an image, solve the window, and let its oldest pose go."""
         motion = self._wheels.predict(frame)
-        loose = loosened(motion)
+        loose = loosen(motion)
         self._belief, self._motion = self._belief.then(motion), self._motion.then(loose)
-        seen, rejected = observed(frame, self.stereo, self._camera, "fixed_lag")
+        seen, rejected = read_observations(frame, self.stereo, self._camera, "fixed_lag")
         registered = None if seen is None else self._registered(frame)
         if registered is not None:
-            self._motion = self._motion.with_measured(registered)
+            self._motion = self._motion.fuse(registered)
         status = ("" if seen is None else self._see(*seen)) or rejected
         self._drive.add(frame.stamp, loose, self._belief.mean, seen)
         if registered is not None:
@@ -137,7 +143,7 @@ class FixedLag(FixedLagOptions):
 
         It starts from the online estimate.
         """
-        return revised([self._drive])[0]
+        return solve_drives([self._drive])[0]
 
     def _registered(self, frame: Frame) -> Gaussian | None:
         """Motion since the last image by the scans; None without both, or if that fails."""
@@ -211,7 +217,7 @@ class FixedLag(FixedLagOptions):
         flat[np.ix_(rows, rows)] = cho_solve(factor, np.eye(len(rows)))
         flat_g[rows] = cho_solve(factor, off)
         fresh = np.arange(3 * len(old), 3 * n_landmarks)
-        flat[fresh, fresh] += LEAST_INFORMATION
+        flat[fresh, fresh] += MIN_INFORMATION
 
         ends = self._poses[:-1], self._poses[1:]
         missed = se2.between(*ends) - np.array([image.motion.mean for image in self._images])
@@ -249,7 +255,7 @@ class FixedLag(FixedLagOptions):
         e[new] += by_pose[new] @ (self._prior.mean[:3] - self._poses[0] - moved)
         by_residual = -inverse(by_landmark[new])
         placed = self._landmarks[image.landmarks[new]] + times(by_residual, e[new])
-        noise = by_residual @ transposed(by_residual)
+        noise = by_residual @ transpose(by_residual)
         self._prior.extend(_POSE, by_residual @ by_pose[new], placed, noise)
         self._prior.mean[2] = wrap(float(self._prior.mean[2]))
         idle = np.ones(self._n_prior, dtype=bool)
@@ -336,9 +342,9 @@ def _add(
     for nodes, by_node in ((first, by_first), (second, by_second)):
         select = np.zeros((n, len(e)))
         select[nodes, k] = 1.0
-        of_node = transposed(by_node)
+        of_node = transpose(by_node)
         H[node, :, node] += (select @ (of_node @ by_node).reshape(-1, 9)).reshape(n, 3, 3)
         g += select @ times(of_node, e)
-    cross = transposed(by_first) @ by_second
+    cross = transpose(by_first) @ by_second
     H[first, :, second] += cross
-    H[second, :, first] += transposed(cross)
+    H[second, :, first] += transpose(cross)

@@ -28,8 +28,8 @@ import numpy as np
 from pydantic import Field
 
 from estimators.base import Belief, Estimate, Prior
-from estimators.gaussian import STILL, Gaussian, stacked
-from estimators.graph.landmark_drive import FLOOR, loosened
+from estimators.gaussian import STILL, Gaussian, stack
+from estimators.graph.landmark_drive import FLOOR, loosen
 from estimators.graph.loop_closing import (
     N_QUANTILES,
     LoopOptions,
@@ -128,7 +128,7 @@ class GraphSlam(GraphSlamOptions):
 
     def step(self, frame: Frame) -> Belief:
         """Move by the wheels; register a scan with the key frame; at a new one look for loops."""
-        motion = loosened(self._wheels.predict(frame))
+        motion = loosen(self._wheels.predict(frame))
         self._in_key, self._by_wheels = self._in_key.then(motion), self._by_wheels.then(motion)
         self._now = frame.stamp
         extras: dict[str, Any] = {}
@@ -162,7 +162,7 @@ class GraphSlam(GraphSlamOptions):
         ]
         path = [_symmetric(keys[placed.node].then(placed.in_key)) for placed in self._path]
         stamps = np.array([placed.stamp for placed in self._path])
-        return Estimate(stamps, *stacked(path), kind="revised")
+        return Estimate(stamps, *stack(path), kind="revised")
 
     def _see(self, scan: PreparedScan | None) -> str:
         """Register a scan with the newest key frame; what came of it."""
@@ -181,7 +181,7 @@ class GraphSlam(GraphSlamOptions):
             return status
         self._failures = 0
         of_base = _scaled(found.motion, 1.0 - self.shared_noise / 2.0)
-        self._in_key = dataclasses.replace(found, motion=of_base).completed(self._in_key)
+        self._in_key = dataclasses.replace(found, motion=of_base).complete(self._in_key)
         if self.left_key_frame(found.motion.mean):
             own_noise = self.shared_noise / 2.0 * found.known_covariance
             self._add_key_frame(scan, found.motion)
@@ -213,7 +213,7 @@ class GraphSlam(GraphSlamOptions):
         """Hold the newest key frame's closures; believe those that enough others agree with."""
         oldest = len(self.graph) - _HELD_FRAMES
         self._held = [edge for edge in self._held if edge.second >= oldest]
-        found = self.proposed()
+        found = self.propose_closures()
         if not found:
             return
         self._held = [*self._held, *found][-_MOST_HELD:]
@@ -223,7 +223,7 @@ class GraphSlam(GraphSlamOptions):
             self._held = [edge for edge in self._held if edge not in agreed]
             self.graph.close(agreed, _ONLINE_TOLERANCE)
 
-    def proposed(self) -> list[Edge]:
+    def propose_closures(self) -> list[Edge]:
         """Closures of the newest key frame that pass each on its own."""
         newest = len(self.graph) - 1
         motions, covariances = self.graph.newest_from(np.arange(newest - 1), exact=False)

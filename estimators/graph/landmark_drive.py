@@ -14,16 +14,16 @@ from collections.abc import Sequence
 import numpy as np
 
 from estimators.base import Estimate
-from estimators.gaussian import Gaussian, compose, stacked, wrap
+from estimators.gaussian import Gaussian, compose, stack, wrap
 from estimators.graph.least_squares import (
-    SQUARES,
+    PLAIN_SQUARES,
     LeastSquaresOptions,
     PoseSightings,
     Problem,
     solve,
 )
 from estimators.landmarks.sightings import Sightings
-from estimators.landmarks.slam_frontend import screened
+from estimators.landmarks.slam_frontend import screen
 from estimators.landmarks.stereo import StereoModel
 from sim.arrays import Array, Ints
 from sim.errors import require
@@ -105,7 +105,7 @@ class LandmarkDrive:
         seen = [np.zeros(0, np.int64), *(seen for _, _, seen in self._images)]
         ids, landmark_rows = np.unique(np.concatenate(seen), return_inverse=True)
         tied = [(pose_of[first], pose_of[second]) for first, second, _ in self._ties]
-        motions, covariances = stacked([*merged, *(motion for _, _, motion in self._ties)])
+        motions, covariances = stack([*merged, *(motion for _, _, motion in self._ties)])
         steps = [*itertools.pairwise(range(len(rows))), *tied]
         first, second = np.array(steps, np.int64).reshape(-1, 2).T
         problem = Problem(
@@ -122,7 +122,7 @@ class LandmarkDrive:
         )
         return problem, ids
 
-    def filled_in(self, poses: Array, joint_covariance: Array) -> tuple[Array, Array]:
+    def fill_in(self, poses: Array, joint_covariance: Array) -> tuple[Array, Array]:
         """Means (T, 3) and covariances (T, 3, 3) of every Frame, between the solved ones too.
 
         Parameters
@@ -151,9 +151,9 @@ class LandmarkDrive:
         return np.array(self._stamps)
 
 
-def revised(
+def solve_drives(
     drives: Sequence[LandmarkDrive],
-    how: LeastSquaresOptions = SQUARES,
+    how: LeastSquaresOptions = PLAIN_SQUARES,
     camera: Sightings | None = None,
     sighted: Sequence[Sighted] = (),
 ) -> list[Estimate]:
@@ -221,7 +221,7 @@ def revised(
     estimates = []
     for drive, (low, high) in zip(drives, itertools.pairwise(ends), strict=True):
         covariance = solution.covariance[3 * low : 3 * high, 3 * low : 3 * high]
-        path = drive.filled_in(solution.poses[low:high], covariance)
+        path = drive.fill_in(solution.poses[low:high], covariance)
         estimates.append(Estimate(drive.stamps, *path, "revised", map=known_map, status=status))
     return estimates
 
@@ -246,7 +246,7 @@ def _joined(parts: Sequence[Problem], ends: Ints) -> Problem:
     )
 
 
-def observed(
+def read_observations(
     frame: Frame, sensor: str, camera: StereoModel, estimator: str
 ) -> tuple[tuple[Array, Ints] | None, str]:
     """Points (K, 3) and ids (K,) of a Frame's observations that can be used; None without any.
@@ -265,11 +265,11 @@ def observed(
         "ids" in seen,
         f"{estimator} needs to know which landmark is which; set sensors.{sensor}.identifies=true",
     )
-    used, status = screened(camera, seen["points_in_camera"], seen["ids"])
+    used, status = screen(camera, seen["points_in_camera"], seen["ids"])
     return (seen["points_in_camera"][used], seen["ids"][used]) if used.any() else None, status
 
 
-def loosened(motion: Gaussian) -> Gaussian:
+def loosen(motion: Gaussian) -> Gaussian:
     """Motion of a Frame with what least squares needs beside slip: sideways play, and a floor."""
     # The arc takes each wheel to turn evenly. A heading that wanders by the variance s^2 over the
     # way d also leaves it sideways, by d^2 s^2 / 12 beyond what the final heading accounts for.

@@ -26,18 +26,18 @@ from estimators.graph.matrices import (
     NormalEquations,
     inverse,
     times,
-    transposed,
+    transpose,
     whitening_of,
 )
 from estimators.landmarks.sightings import Sightings
-from estimators.landmarks.stereo import LEAST_DEPTH_M, StereoModel
+from estimators.landmarks.stereo import MIN_DEPTH_M, StereoModel
 from sim import se2
 from sim.arrays import Array, Ints
 from sim.options import Count, Positive, options
 
 Robust = Literal["none", "huber", "cauchy", "dcs"]
 
-LEAST_INFORMATION = 1e-6  # wrong ids can send a landmark to infinity; a kilometre is enough
+MIN_INFORMATION = 1e-6  # wrong ids can send a landmark to infinity; a kilometre is enough
 _LEAST_DAMPING, _MOST_DAMPING = 1e-9, 1e6
 _SPARSE_POSES = 100  # without landmarks, from so many on the matrix is kept sparse
 
@@ -55,7 +55,7 @@ class LeastSquaresOptions:
     """Most steps of each of the two stages."""
 
 
-SQUARES = LeastSquaresOptions()
+PLAIN_SQUARES = LeastSquaresOptions()
 
 
 @dataclass(frozen=True)
@@ -164,7 +164,7 @@ class Solution:
 def solve(
     problem: Problem,
     poses: Array,
-    how: LeastSquaresOptions = SQUARES,
+    how: LeastSquaresOptions = PLAIN_SQUARES,
     *,
     tolerance: float = 1e-9,
 ) -> Solution:
@@ -287,7 +287,7 @@ class _Linearised:
     def _by_landmark(self, blocks: Array) -> bsr_array:
         """Blocks (K, 3, 3) of the observations as a sparse matrix (3 N, 3 T), transposed."""
         shape = 3 * len(self.V), self.H.shape[0]
-        return bsr_array((transposed(blocks), self.problem.pose_rows, self.splits), shape=shape)
+        return bsr_array((transpose(blocks), self.problem.pose_rows, self.splits), shape=shape)
 
     def step(self, damping: float) -> tuple[Array, Array] | None:
         """Changes of the poses (T, 3) and landmarks (N, 3); None if it cannot be solved."""
@@ -304,7 +304,7 @@ class _Linearised:
             return None
         of_poses = -solved.reshape(-1, 3)
         rest = self.h.copy()
-        turned = times(transposed(self.W), of_poses[self.problem.pose_rows])
+        turned = times(transpose(self.W), of_poses[self.problem.pose_rows])
         np.add.at(rest, self.problem.landmark_rows, turned)
         return of_poses, -times(V_inverse, rest)
 
@@ -374,14 +374,14 @@ class _Residuals:
         weighted = whitening * np.sqrt(weight)[:, None, None]
         seen = seen * np.sqrt(weight)[:, None]
         by_pose, by_landmark = weighted @ by_pose, weighted @ by_landmark
-        of_pose, of_landmark = transposed(by_pose), transposed(by_landmark)
+        of_pose, of_landmark = transpose(by_pose), transpose(by_landmark)
         sums.add([p.pose_rows], [by_pose], seen)
         if p.sightings is not None:
             sighted, *sides = p.sightings.residuals(poses, in_image)
             lost, weight = self._loss(np.sum(sighted**2, axis=1))
             loss = np.append(loss, lost)
             sums.add([p.sightings.seeing_rows, p.sightings.seen_rows], sides, sighted, weight)
-        V = np.tile(LEAST_INFORMATION * np.eye(3), (n_landmarks, 1, 1))
+        V = np.tile(MIN_INFORMATION * np.eye(3), (n_landmarks, 1, 1))
         h = np.zeros((n_landmarks, 3))
         np.add.at(V, p.landmark_rows, of_landmark @ by_landmark)
         np.add.at(h, p.landmark_rows, times(of_landmark, seen))
@@ -460,7 +460,7 @@ def residuals_of(
     if not (in_image and camera.in_image):
         return predicted - points, by_pose, by_landmark
     # What is guessed to lie behind the camera is pulled before it
-    predicted[:, 2] = np.maximum(predicted[:, 2], LEAST_DEPTH_M)
+    predicted[:, 2] = np.maximum(predicted[:, 2], MIN_DEPTH_M)
     image = camera.to_image(predicted)
     by_point = -image[:, :, None] * np.array([0.0, 0.0, 1.0])
     by_point[:, 0, 0] = by_point[:, 1, 1] = camera.focal_px

@@ -65,7 +65,7 @@ class Factor:
         for begin in range(0, len(poses), _AT_ONCE):
             part = np.asarray(poses)[begin : begin + _AT_ONCE]
             own = self.columns(part).reshape(-1, 3, len(part), 3)[part, :, np.arange(len(part))]
-            found[begin : begin + len(part)] = (own + transposed(own)) / 2.0
+            found[begin : begin + len(part)] = (own + transpose(own)) / 2.0
         return found
 
     @cached_property
@@ -101,7 +101,7 @@ class NormalEquations:
         them.
         """
         for own, by_own in zip(rows, sides, strict=True):
-            weighted = transposed(by_own)
+            weighted = transpose(by_own)
             if weights is not None:
                 weighted = weights[:, None, None] * weighted
             np.add.at(self.g, own, times(weighted, e))
@@ -124,7 +124,7 @@ def times(matrices: Array, vectors: Array) -> Array:
     return (matrices @ vectors[:, :, None])[:, :, 0]
 
 
-def transposed(matrices: Array) -> Array:
+def transpose(matrices: Array) -> Array:
     """Each of the matrices (K, m, n) transposed."""
     return matrices.transpose(0, 2, 1)
 

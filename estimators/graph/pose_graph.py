@@ -13,9 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from estimators.gaussian import Gaussian, compose, stacked
+from estimators.gaussian import Gaussian, compose, stack
 from estimators.graph.least_squares import LeastSquaresOptions, Problem, information_at, solve
-from estimators.graph.matrices import Factor, inverse, times, transposed, whitening_of
+from estimators.graph.matrices import Factor, inverse, times, transpose, whitening_of
 from sim import se2
 from sim.arrays import Array, Ints
 
@@ -114,10 +114,10 @@ class PoseGraph:
         """As above, with the covariances (K, 3, 3) of the nodes with the one."""
         first, second = self.poses[nodes], np.tile(self.poses[node], (len(nodes), 1))
         by_first, by_second = se2.between_jacobians(first, second)
-        mixed = by_first @ cross @ transposed(by_second)
-        covariances = by_first @ self._own[nodes] @ transposed(by_first)
-        covariances += by_second @ self._own[node] @ transposed(by_second)
-        return se2.between(first, second), covariances + mixed + transposed(mixed)
+        mixed = by_first @ cross @ transpose(by_second)
+        covariances = by_first @ self._own[nodes] @ transpose(by_first)
+        covariances += by_second @ self._own[node] @ transpose(by_second)
+        return se2.between(first, second), covariances + mixed + transpose(mixed)
 
     def joint_innovation(self, edges: list[Edge]) -> tuple[Array, Array]:
         """What K edges miss the graph by, (3 K,), and its joint covariance, their noise included.
@@ -200,4 +200,4 @@ class PoseGraph:
 def _stacked(edges: list[Edge]) -> tuple[Ints, Ints, Array, Array]:
     """First and second node (E,), motions (E, 3) and covariances (E, 3, 3)."""
     ends = np.array([(edge.first, edge.second) for edge in edges], np.int64).reshape(-1, 2)
-    return ends[:, 0], ends[:, 1], *stacked([edge.motion for edge in edges])
+    return ends[:, 0], ends[:, 1], *stack([edge.motion for edge in edges])

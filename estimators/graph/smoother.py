@@ -9,7 +9,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from estimators.base import Belief, Estimate, Prior, TeamEstimator
-from estimators.graph.landmark_drive import LandmarkDrive, Sighted, loosened, observed, revised
+from estimators.graph.landmark_drive import (
+    LandmarkDrive,
+    Sighted,
+    loosen,
+    read_observations,
+    solve_drives,
+)
 from estimators.graph.least_squares import LeastSquaresOptions, Problem
 from estimators.landmarks.sightings import Sightings, dead_reckoning
 from estimators.landmarks.stereo import StereoModel, TeamEyesOptions
@@ -63,8 +69,8 @@ class Smoother(SmootherOptions, TeamEstimator):
         for frame in frames:
             robot, motion = frame.robot, self._wheels[frame.robot].predict(frame)
             belief = self._beliefs[robot] = self._beliefs[robot].then(motion)
-            seen, status = observed(frame, self.stereo, self._camera, "smoother")
-            self._drives[robot].add(frame.stamp, loosened(motion), belief.mean, seen)
+            seen, status = read_observations(frame, self.stereo, self._camera, "smoother")
+            self._drives[robot].add(frame.stamp, loosen(motion), belief.mean, seen)
             extras = {"status": status} if status else {}
             beliefs.append(Belief(belief.mean.copy(), belief.covariance.copy(), extras))
         if self._sightings is not None:
@@ -80,7 +86,7 @@ class Smoother(SmootherOptions, TeamEstimator):
 
     def finish_team(self) -> list[Estimate]:
         """Least squares over all Frames of a team: the path of each robot."""
-        return revised(self._drives, self, self._sightings, self._sighted)
+        return solve_drives(self._drives, self, self._sightings, self._sighted)
 
     def problem(self) -> tuple[Problem, Array]:
         """The least-squares problem over all Frames so far, and poses (T, 3) to start from."""

@@ -17,7 +17,7 @@ from estimators.gaussian import STILL, Gaussian, compose, wrap
 from estimators.landmarks.joint import JointGaussian, mahalanobis_squared
 from estimators.landmarks.sightings import Sightings, dead_reckoning, pose_by_points, team_starts
 from estimators.landmarks.slam_frontend import Image, LandmarkSlamOptions, SlamFrontEnd
-from estimators.landmarks.stereo import LEAST_DEPTH_M
+from estimators.landmarks.stereo import MIN_DEPTH_M
 from estimators.wheels import NO_MOTION, GainOptions, gained_motion
 from sim.arrays import Array, Ints
 from sim.errors import require
@@ -152,7 +152,7 @@ class EkfSlam(EkfSlamOptions, TeamEstimator):
         if self._gains:
             both = slice(own.start, self._gains.stop)  # of one robot: its pose and the gains
             P = self._state.covariance[both, both].copy()
-            mean = self._gained.applied(pose.mean, P, slice(0, 3), slice(3, 6))
+            mean = self._gained.apply(pose.mean, P, slice(0, 3), slice(3, 6))
             pose = Gaussian(mean, P[:3, :3])
             extras["wheel_gains"] = self._state.mean[self._gains].copy()
         else:
@@ -192,7 +192,7 @@ class EkfSlam(EkfSlamOptions, TeamEstimator):
         P, own, motion = self._state.covariance, _own(robot), self._motions[robot]
         if self._gains:
             walked = self.gain_wander_m * self._gained.travel_m
-            self._state.mean[own] = self._gained.applied(self._state.mean[own], P, own, self._gains)
+            self._state.mean[own] = self._gained.apply(self._state.mean[own], P, own, self._gains)
             P[self._gains, self._gains] += walked * np.eye(3)
             self._gained = NO_MOTION
             return
@@ -217,7 +217,7 @@ class EkfSlam(EkfSlamOptions, TeamEstimator):
         robot = frame.robot
         extras: dict[str, Any] = {"status": image.status} if image.status else {}
         if len(image.points) > _MOST_OBSERVATIONS:
-            image = image.of(np.arange(len(image.points)) < _MOST_OBSERVATIONS)
+            image = image.select(np.arange(len(image.points)) < _MOST_OBSERVATIONS)
             extras["status"] = f"observations beyond {_MOST_OBSERVATIONS} rejected"
         slots = (
             self.front_end.known(image)
@@ -226,12 +226,12 @@ class EkfSlam(EkfSlamOptions, TeamEstimator):
         )
         if self.gate_probability is not None and len(slots):
             passed = self._passed(robot, image, slots)
-            image, slots = image.of(passed), slots[passed]
-        self.front_end.counted(image, frame)
+            image, slots = image.select(passed), slots[passed]
+        self.front_end.note_counted(image, frame)
         old = slots >= 0
         fits = old | (np.cumsum(~old) <= _MOST_LANDMARKS - self._n_landmarks)
         if not fits.all():
-            image, slots, old = image.of(fits), slots[fits], old[fits]
+            image, slots, old = image.select(fits), slots[fits], old[fits]
             extras["status"] = f"map full: landmarks beyond {_MOST_LANDMARKS} rejected"
         if old.any() and not self._revisit(robot, slots[old], image.points[old]):
             extras["status"] = "update rejected: broken covariance, not positive definite"
@@ -248,7 +248,7 @@ class EkfSlam(EkfSlamOptions, TeamEstimator):
             return slots
         predicted = self._camera.predict(self._state.mean[_own(robot)], self._landmarks)[0]
         near = np.linalg.norm(predicted, axis=1) < self.front_end.reach_m
-        candidates = np.flatnonzero((predicted[:, 2] > LEAST_DEPTH_M) & near)
+        candidates = np.flatnonzero((predicted[:, 2] > MIN_DEPTH_M) & near)
         if len(candidates) == 0:
             return slots
         _, *by = self._predict(robot, self._landmarks[candidates])
@@ -378,7 +378,7 @@ class EkfSlam(EkfSlamOptions, TeamEstimator):
         spread = self._predicted_spread(own, at, of_pose, of_other)
         v, R = sightings.camera.innovation(predicted[None], points[:, None])
         distances = mahalanobis_squared(v, spread + R)
-        distances[:, predicted[:, 2] < LEAST_DEPTH_M] = np.inf
+        distances[:, predicted[:, 2] < MIN_DEPTH_M] = np.inf
         if numbers is not None:
             distances[numbers[:, None] != others] = np.inf
         rows, columns = _matches(distances, self.sighting_d0)

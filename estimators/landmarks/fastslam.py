@@ -9,14 +9,14 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from estimators.base import Belief, Estimate, Prior, TeamEstimator
-from estimators.gaussian import STILL, Gaussian, compose, rotated
+from estimators.gaussian import STILL, Gaussian, compose, rotate
 from estimators.landmarks import particle_kernels as ekf
 from estimators.landmarks.joint import mahalanobis_squared
 from estimators.landmarks.particle_maps import LandmarkMaps, Maps
 from estimators.landmarks.particle_path import ParticlePath, packed_mount
 from estimators.landmarks.sightings import Sightings, dead_reckoning, team_starts
 from estimators.landmarks.slam_frontend import Image, LandmarkSlamOptions, SlamFrontEnd
-from estimators.particles import Scheme, in_place, normalize, resample, underflowed
+from estimators.particles import Scheme, have_underflowed, keep_survivors, normalize, resample
 from sim.arrays import Array, Ints
 from sim.errors import required
 from sim.options import NonNegative, Positive, options
@@ -160,19 +160,19 @@ class FastSLAM(FastSlamOptions, TeamEstimator):
             slots = self.front_end.known(image)
             if self.gate_probability is not None and len(slots):
                 passed = self._passed(path, image, slots)
-                image, slots, points = image.of(passed), slots[passed], points[passed]
+                image, slots, points = image.select(passed), slots[passed], points[passed]
             self._maps.touch(slots[slots >= 0])
-        self.front_end.counted(image, frame)
+        self.front_end.note_counted(image, frame)
         by_motion = self.proposal == "motion" or len(points) == 0
-        poses = path.moved(normals if by_motion else np.zeros_like(normals))
+        poses = path.move(normals if by_motion else np.zeros_like(normals))
         if not known:
             # of the motion not yet drawn, in axes of the camera after it
             angle = -float(path.rolled.mean[2] + self.front_end.camera.mount[2])
-            spread = np.zeros((3, 3)) if by_motion else rotated(path.rolled.covariance, angle)
+            spread = np.zeros((3, 3)) if by_motion else rotate(path.rolled.covariance, angle)
             slots = self._associate(path, image, spread)
         if not by_motion:
             gained += self._propose(path, normals, slots, points)
-            poses = path.moved(normals)
+            poses = path.move(normals)
         gained += self._observe(path, slots, points)
         self._create(path, slots, image)
         path.poses = poses
@@ -187,7 +187,7 @@ class FastSLAM(FastSlamOptions, TeamEstimator):
     def _gain(self, gained: Array) -> bool:
         """Add log weights (M,); with False, and equal weights, if all have underflowed."""
         weights = self._log_weights + gained
-        lost = underflowed(weights)
+        lost = have_underflowed(weights)
         self._log_weights = np.zeros(self.n_particles) if lost else weights
         self._accumulated = self._accumulated + (0.0 if lost else gained)
         self._weigh()
@@ -205,12 +205,12 @@ class FastSLAM(FastSlamOptions, TeamEstimator):
             for each in (path, self._paths[number]):
                 if each.rolled is not STILL:
                     each.draw(self._rng)
-            path.moved(np.zeros((3, path.poses.shape[1])), mount, state)
+            path.move(np.zeros((3, path.poses.shape[1])), mount, state)
             marker = ekf.known_landmark(self._paths[number].poses, sightings.marker_z_m)
             ekf.update(marker, np.zeros(1, np.int64), point[None], state, camera)
             if ekf.distances(state, self.n_particles).min() < self.sighting_d0:
                 used = True
-                gained = ekf.summed(state, self.n_particles)
+                gained = ekf.log_weights(state, self.n_particles)
                 self._gain(gained + ekf.log_scale(point[None], camera))
         return used
 
@@ -305,7 +305,7 @@ class FastSLAM(FastSlamOptions, TeamEstimator):
                 start,
                 importance,
             )
-            path.moved(start)
+            path.move(start)
         inform(maps, rows, points, state, camera)
         ekf.propose(path.poses, path.root, path.stretch, state, start, normals, importance)
         log_weights: Array = 0.5 * importance[0] - np.log(importance[1])
@@ -328,7 +328,7 @@ class FastSLAM(FastSlamOptions, TeamEstimator):
         for start in range(0, len(rows), ekf.GROUP):
             group = slice(start, start + ekf.GROUP)
             update(self._maps.data, rows[group], points[group], path.state, self._camera)
-            gained += ekf.summed(path.state, self.n_particles)
+            gained += ekf.log_weights(path.state, self.n_particles)
         return gained
 
     def _create(self, path: ParticlePath, slots: Ints, image: Image) -> None:
@@ -353,7 +353,7 @@ class FastSLAM(FastSlamOptions, TeamEstimator):
     def _resample(self) -> None:
         """Draw particles by their weights; survivors keep their place."""
         n = self.n_particles
-        ancestors = in_place(resample(self._log_weights, n, self._rng, self.resampling), n)
+        ancestors = keep_survivors(resample(self._log_weights, n, self._rng, self.resampling), n)
         self._maps.resample(ancestors)
         for path in self._paths:
             path.resample(ancestors)

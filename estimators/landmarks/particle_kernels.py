@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from estimators.landmarks.stereo import LEAST_DEPTH_M, PackedCamera
+from estimators.landmarks.stereo import MIN_DEPTH_M, PackedCamera
 from sim.arrays import Array, Ints
 from sim.compiled import njit
 
@@ -58,7 +58,7 @@ def distances(state: Array, n_particles: int) -> Array:
     return state[:, _DISTANCE : _DISTANCE + LANES].reshape(-1)[:n_particles]
 
 
-def summed(state: Array, n_particles: int) -> Array:
+def log_weights(state: Array, n_particles: int) -> Array:
     """Log weights (M,) that a group of observations gave, eq. (13), but for `log_scale`."""
     distances, determinants, depths = (
         state[:, field : field + LANES].reshape(-1)[:n_particles]
@@ -125,7 +125,7 @@ def _noise(S: Array, j: int, at: _Vector, camera: PackedCamera) -> tuple[_Symmet
     """R in map axes at a point off the camera of lane j, and the point's depth."""
     px, py, pz = at
     cos, sin = S[_COS + j], S[_SIN + j]
-    x, z = sin * px - cos * py, max(cos * px + sin * py, LEAST_DEPTH_M)
+    x, z = sin * px - cos * py, max(cos * px + sin * py, MIN_DEPTH_M)
     by_focal, by_disparity = z * camera.per_focal, z * camera.per_disparity
     scale, apart = by_focal * by_focal, by_disparity * by_disparity * camera.disparity_variance
     together = camera.correlated * apart  # share of the disparity's variance that correlates
@@ -451,7 +451,7 @@ def associate(
                 L = maps[place[slot], block]
                 px, py = L[_X + j] - S[_CAMERA_X + j], L[_Y + j] - S[_CAMERA_Y + j]
                 unlike = unlikeness[i, births[slot, m]] if described else 0.0
-                if cos * px + sin * py < LEAST_DEPTH_M or unlike > 0.0:
+                if cos * px + sin * py < MIN_DEPTH_M or unlike > 0.0:
                     continue
                 v, R, _ = _innovation(L, S, j, seen, camera)
                 dx, dy = L[_X + j] - S[_BASE_X + j], L[_Y + j] - S[_BASE_Y + j]

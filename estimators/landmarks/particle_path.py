@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from estimators.base import Estimate
-from estimators.gaussian import STILL, Gaussian, root, rotated, stacked
+from estimators.gaussian import STILL, Gaussian, root, rotate, stack
 from estimators.landmarks import particle_kernels as ekf
 from estimators.particles import Lineages
 from estimators.wheels import WheelPrediction
@@ -50,7 +50,7 @@ class ParticlePath:
 
     def scatter(self, start: Gaussian, rng: np.random.Generator) -> None:
         """Draw the particles from the start."""
-        turned = rotated(start.covariance, -float(start.mean[2]))
+        turned = rotate(start.covariance, -float(start.mean[2]))
         normals = rng.standard_normal((3, len(self.state) * ekf.LANES))
         drawn = se2.compose(start.mean, (root((turned + turned.T) / 2.0) @ normals).T)
         headings = drawn[:, 2]
@@ -79,10 +79,8 @@ class ParticlePath:
         self.root = rolled
         return normals
 
-    def moved(
-        self, normals: Array, mount: Array | None = None, state: Array | None = None
-    ) -> Array:
-        """Poses (5, lanes) after the motion; writes the state of a camera, by default the own."""
+    def move(self, normals: Array, mount: Array | None = None, state: Array | None = None) -> Array:
+        """Poses (5, lanes) after the motion; writes the state of a camera, by default its own."""
         mount = self._mount if mount is None else mount
         state = self.state if state is None else state
         noise = self.stretch * normals
@@ -90,7 +88,7 @@ class ParticlePath:
 
     def draw(self, rng: np.random.Generator) -> None:
         """Draw the motion by the wheels alone."""
-        self.poses = self.moved(self.normals(rng))
+        self.poses = self.move(self.normals(rng))
         self.settle()
 
     def settle(self) -> None:
@@ -122,7 +120,7 @@ class ParticlePath:
             for _, draw, since in self._frames
         ]
         stamps = np.array([stamp for stamp, _, _ in self._frames])
-        return Estimate(stamps, *stacked(beliefs), kind="revised", map=known_map)
+        return Estimate(stamps, *stack(beliefs), kind="revised", map=known_map)
 
 
 def packed_mount(mount: Array) -> Array:

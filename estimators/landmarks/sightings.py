@@ -36,12 +36,12 @@ def team_starts(
     for number, other in enumerate(others, start=1):
         require(
             other.sensors == first.sensors,
-            f"{estimator}: the sensors of robot {number} are not those of robot 0",
+            f"{estimator}: robot {number} has other sensors than robot 0",
         )
     starts = [None if p.mean is None else p.require_start(estimator) for p in others]
     require(
         None not in starts or front_end.identified,
-        f"{estimator}: a robot of unknown start is placed by landmarks with ids; set "
+        f"{estimator}: a robot with an unknown start needs landmarks with ids; set "
         "estimator.association=known",
     )
     return [front_end.first_pose, *starts]

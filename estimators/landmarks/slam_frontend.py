@@ -101,7 +101,7 @@ class Image:
     used: NDArray[np.bool_]
     status: str
 
-    def of(self, kept: NDArray[np.bool_]) -> Image:
+    def select(self, kept: NDArray[np.bool_]) -> Image:
         """Return the image with these (K,) of its observations only."""
         used = self.used.copy()
         used[np.flatnonzero(used)[~kept]] = False
@@ -110,7 +110,7 @@ class Image:
         return Image(*parts, used, self.status)
 
 
-def screened(
+def screen(
     camera: StereoModel, points_in_camera: Array, ids: Ints | None
 ) -> tuple[NDArray[np.bool_], str]:
     """Which observations (A,) of an image can be used, and what is wrong with the others.
@@ -194,7 +194,7 @@ class SlamFrontEnd:
         """Observations of a Frame's image that can be used; of duplicate ids the first."""
         seen = frame.readings[self.believed.stereo]
         all_points, all_ids = seen["points_in_camera"], seen.get("ids")
-        used, status = screened(self.camera, all_points, all_ids if self.identified else None)
+        used, status = screen(self.camera, all_points, all_ids if self.identified else None)
         require(
             not (self.identified and all_ids is None and used.any()),
             f"{self._estimator}: observations without ids; set "
@@ -211,9 +211,9 @@ class SlamFrontEnd:
         if self.believed.repeat_s == 0.0:
             return image
         last = [self._last_s.get((frame.robot, i), -math.inf) for i in _listed(image)]
-        return image.of(frame.stamp - np.array(last) >= self.believed.repeat_s)
+        return image.select(frame.stamp - np.array(last) >= self.believed.repeat_s)
 
-    def counted(self, image: Image, frame: Frame) -> None:
+    def note_counted(self, image: Image, frame: Frame) -> None:
         """Note when the landmarks of a Frame's image counted."""
         if self.believed.repeat_s > 0.0:
             self._last_s |= {(frame.robot, i): frame.stamp for i in _listed(image)}

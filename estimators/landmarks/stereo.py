@@ -39,7 +39,7 @@ from sim.sensors import StereoCamera
 NoiseModel = Literal["camera", "diagonal", "correlated", "image"]
 NoiseAt = Literal["predicted", "measured"]
 
-LEAST_DEPTH_M = 0.1  # nearer than this no camera sees, and noise laws end
+MIN_DEPTH_M = 0.1  # nearer than this no camera sees, and noise laws end
 
 
 @options("estimator")
@@ -168,7 +168,7 @@ class StereoModel:
         points = np.asarray(points_in_camera, dtype=np.float64)
         farthest = self.focal_px * self.baseline_m / math.sqrt(self.variances_px2[2])
         depth, finite = points[..., 2], np.isfinite(points).all(axis=-1)
-        return finite & (depth > LEAST_DEPTH_M / 2.0) & (depth < farthest)
+        return finite & (depth > MIN_DEPTH_M / 2.0) & (depth < farthest)
 
     def axes(self, pose: ArrayLike) -> tuple[Array, Array]:
         """Camera position (..., 3) in map, and C (..., 3, 3) from map to camera axes."""
@@ -217,7 +217,7 @@ class StereoModel:
     def covariance(self, points_in_camera: ArrayLike) -> Array:
         """R (..., 3, 3), m^2, at points (..., 3) in the camera frame."""
         points = np.asarray(points_in_camera, dtype=np.float64)
-        depth = np.maximum(points[..., 2], LEAST_DEPTH_M)
+        depth = np.maximum(points[..., 2], MIN_DEPTH_M)
         ray = np.concatenate([points[..., :2], depth[..., None]], axis=-1)
         scale = (depth / (self.focal_px * self.baseline_m)) ** 2 * self.variances_px2[2]
         R: Array = scale[..., None, None] * ray[..., :, None] * ray[..., None, :]
@@ -233,7 +233,7 @@ class StereoModel:
         seen = np.asarray(measured, dtype=np.float64)
         v, at = seen - expected, seen if self.at_measured else expected
         if self.in_image:
-            v = v * (np.maximum(at[..., 2], LEAST_DEPTH_M) / seen[..., 2])[..., None]
+            v = v * (np.maximum(at[..., 2], MIN_DEPTH_M) / seen[..., 2])[..., None]
         return v, self.covariance(at)
 
     def to_image(self, points_in_camera: ArrayLike) -> Array:

@@ -16,13 +16,13 @@ import numpy as np
 from scipy.special import chdtri
 
 from estimators.base import Belief, Prior
-from estimators.gaussian import STILL, Gaussian, between, compose, rotated, update, wrap
+from estimators.gaussian import STILL, Gaussian, between, compose, rotate, update, wrap
 from estimators.laser.icp import PreparedScan, Rules
 from estimators.laser.scan_matching import (
     KeyFrameOptions,
     Match,
     MatcherOptions,
-    moved_beyond,
+    exceeds,
 )
 from estimators.wheels import EncoderTickOptions, WheelPrediction
 from sim.arrays import Array
@@ -140,7 +140,7 @@ class EkfIcp(EkfIcpOptions):
         if self._last is None or not (self.register_distance_m or self.register_turn_rad):
             return True
         moved, _, _ = between(self._mean[_LAST], self._mean[_POSE])
-        return moved_beyond(moved, self.register_distance_m, self.register_turn_rad)
+        return exceeds(moved, self.register_distance_m, self.register_turn_rad)
 
     def _correct(self, scan: PreparedScan | None, extras: dict[str, Any]) -> None:
         """Register the scan against the key frame, or else the last scan, and take it in."""
@@ -213,7 +213,7 @@ class EkfIcp(EkfIcpOptions):
         extras["nis"], extras["nis_dof"] = nis, len(C)
         if nis > self._gates[len(C)]:
             return False
-        self._insert(rotated(share / 2.0 * match.known_covariance, self._mean[place][2]))
+        self._insert(rotate(share / 2.0 * match.known_covariance, self._mean[place][2]))
         H = np.zeros((3, 12))
         H[:, place], H[:, _NEW] = -by_twist, by_twist
         noise = (1.0 - share) * C @ R @ C.T + _TINY * np.eye(len(C))
@@ -278,7 +278,7 @@ class EkfIcp(EkfIcpOptions):
         """Shared noise (3, 3) in map of a scan that was not registered: from one against itself."""
         match = self.matcher.match(scan, scan, STILL, self._laser, self._rng)
         noise = self.shared_noise / 2.0 * match.known_covariance
-        return np.zeros((3, 3)) if match.failed else rotated(noise, self._mean[8])
+        return np.zeros((3, 3)) if match.failed else rotate(noise, self._mean[8])
 
 
 def _from_twist(pose: Array) -> Array:

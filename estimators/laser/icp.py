@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
 from estimators.laser.icp_iterations import Fit, Pair, Sample, Settings, Stage, align
-from estimators.laser.icp_judgement import confront, judge
+from estimators.laser.icp_judgement import count_agreement, judge
 from estimators.laser.icp_start import as_segments, heading_by_lines, planes_of, representatives
 from estimators.laser.scan_lines import PreparedScan, Segments, prepare
 from sim.arrays import Array, Ints
@@ -37,10 +37,10 @@ _REST_M, _REST_RAD = 1e-5, 1e-5  # iterations end when the increment falls below
 # Tuning constants, in standard deviations; without a kernel every match within the gate counts
 _WIDTHS = {"tukey": 6.0, "huber": 1.345, "none": math.inf}
 _AGREEMENT = 6.0  # range standard deviations from a line of the other scan
-LEAST_POINTS = 3  # of a scan that can be registered
-LEAST_OVERLAP = 0.6  # share of the source's points that must agree with the target
-LEAST_AGREEMENT = 0.5  # the same of those, in both scans, that bear on any one direction
-LEAST_INFORMATION = 4.0  # times the spurious information that the noise of the lines makes
+MIN_POINTS = 3  # of a scan that can be registered
+MIN_OVERLAP = 0.6  # share of the source's points that must agree with the target
+MIN_AGREEMENT = 0.5  # the same of those, in both scans, that bear on any one direction
+MIN_INFORMATION_RATIO = 4.0  # times the spurious information that the noise of the lines makes
 
 
 @options("estimator")
@@ -63,7 +63,7 @@ class Rules:
     tuning seeds) jump by decimetres now and then."""
 
 
-USUAL = Rules()
+DEFAULT_RULES = Rules()
 
 
 @dataclass(frozen=True)
@@ -142,10 +142,10 @@ def _register(
         matrix[0, 1], matrix[0, 2], matrix[1, 2] = matrix[1, 0], matrix[2, 0], matrix[2, 1]
     agreed, denied = np.zeros((3, 3)), np.zeros((3, 3))
     tolerance = _AGREEMENT * pair.noise_m
-    confront(source, target, pose, pose[2], (0.0, 0.0), tolerance, agreed, denied)
+    count_agreement(source, target, pose, pose[2], (0.0, 0.0), tolerance, agreed, denied)
     cos, sin = math.cos(pose[2]), math.sin(pose[2])
     back = np.array([-cos * pose[0] - sin * pose[1], sin * pose[0] - cos * pose[1], -pose[2]])
-    confront(target, source, back, 0.0, (pose[0], pose[1]), tolerance, agreed, denied)
+    count_agreement(target, source, back, 0.0, (pose[0], pose[1]), tolerance, agreed, denied)
     return fit, iterations, converged, normal, information, spurious, agreed, denied
 
 
@@ -158,7 +158,7 @@ def register(
     gate_m: float = 2.0,
     gate_rad: float | None = None,
     heading_window_rad: float | None = None,
-    rules: Rules = USUAL,
+    rules: Rules = DEFAULT_RULES,
 ) -> Registration:
     """Find the pose of the source scan in the frame of the target scan.
 
@@ -193,7 +193,7 @@ def register(
     known = get_args(Metric)
     require(metric in known, f"metric must be one of {', '.join(known)}, got {metric!r}")
     whole_lines = metric == "point_to_line"
-    too_few = min(len(source.points), len(target.points)) < LEAST_POINTS
+    too_few = min(len(source.points), len(target.points)) < MIN_POINTS
     if too_few or (whole_lines and len(target.lines) == 0):
         n, zero = len(source.points), np.zeros((3, 3))
         return Registration(
@@ -238,11 +238,11 @@ def register(
     )
     pose[2] = math.remainder(pose[2], 2.0 * math.pi)
     status = "ok"
-    if np.count_nonzero(fit.weights) < LEAST_OVERLAP * len(fit.weights):
+    if np.count_nonzero(fit.weights) < MIN_OVERLAP * len(fit.weights):
         status = "poor_overlap"
-    elif not _positive_definite(information - LEAST_INFORMATION * spurious):
+    elif not _positive_definite(information - MIN_INFORMATION_RATIO * spurious):
         status = "degenerate"
-    elif not _positive_definite((1.0 - LEAST_AGREEMENT) * agreed - LEAST_AGREEMENT * denied):
+    elif not _positive_definite((1.0 - MIN_AGREEMENT) * agreed - MIN_AGREEMENT * denied):
         status = "poor_overlap"
     elif not converged:
         status = "not_converged"

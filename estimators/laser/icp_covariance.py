@@ -19,7 +19,13 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from estimators.laser.icp import LEAST_INFORMATION, PreparedScan, Registration, prepare, register
+from estimators.laser.icp import (
+    MIN_INFORMATION_RATIO,
+    PreparedScan,
+    Registration,
+    prepare,
+    register,
+)
 from sim import se2
 from sim.arrays import Array, Ints
 from sim.compiled import njit
@@ -287,7 +293,7 @@ def split_directions(registration: Registration) -> tuple[Array, Array]:
     share, basis = np.linalg.eigh(root @ (spurious + least) @ root.T)
     directions = root.T @ basis
     directions /= np.linalg.norm(directions, axis=0)
-    loose = share > 1.0 / LEAST_INFORMATION
+    loose = share > 1.0 / MIN_INFORMATION_RATIO
     return unit[:, None] * directions[:, ~loose], unit[:, None] * directions[:, loose]
 
 

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from estimators.laser.scan_lines import PreparedScan, Segments, ranked
+from estimators.laser.scan_lines import PreparedScan, Segments, select
 from sim.arrays import Array, Ints
 from sim.compiled import njit
 
@@ -108,7 +108,7 @@ class Fit(NamedTuple):
 
 
 @njit(forceinline=True, error_model="numpy", fastmath={"contract"})
-def turned(cos: float, sin: float, x: float, y: float) -> tuple[float, float]:
+def rotate(cos: float, sin: float, x: float, y: float) -> tuple[float, float]:
     """A vector turned by an angle."""
     return cos * x - sin * y, sin * x + cos * y
 
@@ -222,7 +222,7 @@ def _match(
         px, py = pair.source.points[i, 0], pair.source.points[i, 1]
         misses[k] = math.inf
         if px**2 + py**2 <= reach_m * reach_m:
-            qx, qy = turned(cos, sin, px, py)
+            qx, qy = rotate(cos, sin, px, py)
             start = near if first else fit.matches[i]
             near, misses[k] = nearest(
                 pair.surface, pair.target.full_circle, start, qx + pose[0], qy + pose[1]
@@ -236,7 +236,7 @@ def _trim(misses: Array, share: float) -> None:
     found = misses[misses < math.inf]
     kept = math.ceil((1.0 - share) * len(found))
     if kept > 0:
-        misses[misses > ranked(found, kept - 1)] = math.inf
+        misses[misses > select(found, kept - 1)] = math.inf
 
 
 @njit(forceinline=True, error_model="numpy", fastmath={"contract"})
@@ -271,10 +271,10 @@ def _linearise(
         fit.weights[i], fit.residuals[i] = 0.0, math.nan
         if misses[k] > stage.gate_m * stage.gate_m:
             continue
-        qx, qy = turned(cos, sin, source.points[i, 0], source.points[i, 1])
+        qx, qy = rotate(cos, sin, source.points[i, 0], source.points[i, 1])
         if pair.along_normals:
             n1, n2 = planes.normals[j, 0], planes.normals[j, 1]
-            vx, vy = turned(cos, sin, source.rays[i, 0], source.rays[i, 1])
+            vx, vy = rotate(cos, sin, source.rays[i, 0], source.rays[i, 1])
             miss = off_line(planes, j, qx + pose[0], qy + pose[1])
             variance = pair.noise_m * pair.noise_m
             if pair.whole_lines:

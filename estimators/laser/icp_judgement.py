@@ -10,7 +10,7 @@ from estimators.laser.icp_iterations import (
     add_line,
     add_point,
     off_line,
-    turned,
+    rotate,
     variance_along,
 )
 from estimators.laser.scan_lines import PreparedScan
@@ -40,7 +40,7 @@ def judge(pair: Pair, pose: Array, fit: Fit) -> tuple[Array, Array, Array]:
             fit.matches[i] = -1
         if not weight > 0.0:
             continue
-        qx, qy = turned(cos, sin, source.points[i, 0], source.points[i, 1])
+        qx, qy = rotate(cos, sin, source.points[i, 0], source.points[i, 1])
         if pair.along_normals:
             n1, n2 = pair.planes.normals[fit.matches[i], 0], pair.planes.normals[fit.matches[i], 1]
             add_line(normal, weight, n1, n2, qx, qy)
@@ -50,7 +50,7 @@ def judge(pair: Pair, pose: Array, fit: Fit) -> tuple[Array, Array, Array]:
             continue
         n1, n2 = segments.normals[line, 0], segments.normals[line, 1]
         if not pair.whole_lines:
-            vx, vy = turned(cos, sin, source.rays[i, 0], source.rays[i, 1])
+            vx, vy = rotate(cos, sin, source.rays[i, 0], source.rays[i, 1])
             weight = 1.0 / variance_along(n1, n2, vx, vy, pair.noise_m)
         if members[line] >= _LEAST_MEMBERS:  # a point or two may be there by chance
             add_line(information, weight, n1, n2, qx, qy)
@@ -59,7 +59,9 @@ def judge(pair: Pair, pose: Array, fit: Fit) -> tuple[Array, Array, Array]:
 
 
 @njit(forceinline=True, error_model="numpy", fastmath={"contract"})
-def beams_beside(rays: Array, full_circle: bool, j: int, x: float, y: float) -> tuple[int, bool]:
+def find_beam_before(
+    rays: Array, full_circle: bool, j: int, x: float, y: float
+) -> tuple[int, bool]:
     """The beam before a point, by a walk from a guess, and whether there is one on both sides."""
     n = len(rays)
     for _ in range(n):
@@ -75,7 +77,7 @@ def beams_beside(rays: Array, full_circle: bool, j: int, x: float, y: float) -> 
 
 
 @njit(error_model="numpy", fastmath={"contract"})
-def confront(
+def count_agreement(
     scan: PreparedScan, other: PreparedScan, pose: Array, turn: float, lever: tuple[float, float],
     tolerance: float, agreed: Array, denied: Array,
 ) -> None:  # fmt: skip
@@ -93,9 +95,9 @@ def confront(
         if line < 0:
             continue
         px, py = scan.points[i, 0], scan.points[i, 1]
-        x, y = turned(cos, sin, px, py)
+        x, y = rotate(cos, sin, px, py)
         x, y = x + pose[0], y + pose[1]
-        j, between = beams_beside(rays, other.full_circle, j, x, y)
+        j, between = find_beam_before(rays, other.full_circle, j, x, y)
         if not between:
             j = min(j, len(rays) - 2)
             continue
@@ -106,6 +108,6 @@ def confront(
             on, seen_m = other.line_of_point[k], min(seen_m, other.ranges_m[k])
             near |= on >= 0 and abs(off_line(surface, on, x, y)) < tolerance
         if near or math.hypot(x, y) <= seen_m - 2.0 * tolerance:
-            n1, n2 = turned(c, s, normals[line, 0], normals[line, 1])
-            qx, qy = turned(c, s, px - lever[0], py - lever[1])
+            n1, n2 = rotate(c, s, normals[line, 0], normals[line, 1])
+            qx, qy = rotate(c, s, px - lever[0], py - lever[1])
             add_line(agreed if near else denied, 1.0, n1, n2, qx, qy)

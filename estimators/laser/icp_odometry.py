@@ -100,7 +100,7 @@ class IcpOdometry(IcpOdometryOptions):
             )
             extras["registration_status"] = match.status
             if not match.failed:
-                motion = match.completed(expected)
+                motion = match.complete(expected)
                 extras["registration_covariance"] = motion.covariance
                 belief = anchor.belief.then(motion)
                 self._key, self._key_to_last = anchor, motion

@@ -41,7 +41,7 @@ _Sums = tuple[float, float, float, float, float]
 
 
 class Segments(NamedTuple):
-    """Straight pieces with ends; what can be matched with.
+    """Line segments, the features that points are matched with.
 
     Attributes
     ----------
@@ -65,7 +65,7 @@ class Segments(NamedTuple):
 
 
 class PreparedScan(NamedTuple):
-    """What registration needs of a scan; K of its N beams saw something.
+    """A scan prepared for registration; K of its N beams have a return.
 
     Attributes
     ----------
@@ -161,7 +161,7 @@ def without_sparse_lines(scan: PreparedScan, most_gap_m: float) -> PreparedScan:
 
 
 @njit()
-def ranked(values: Array, rank: int) -> float:
+def select(values: Array, rank: int) -> float:
     """The value at a place of the sorted values, without sorting them.
 
     `numpy.partition` does the same, but takes eleven seconds to compile.
@@ -196,7 +196,7 @@ def _noise(ranges: Array, rays: Array, beams: Ints) -> float:
         n += 1
     if n < _LEAST_BENDS:
         return _NOISE_FLOOR_M
-    return max(ranked(found[:n], n // 2) / _MEDIAN_OF_NORMAL, _NOISE_FLOOR_M)
+    return max(select(found[:n], n // 2) / _MEDIAN_OF_NORMAL, _NOISE_FLOOR_M)
 
 
 @njit(forceinline=True, error_model="numpy", fastmath={"contract"})

@@ -19,8 +19,8 @@ from estimators.base import LaserOptions
 from estimators.gaussian import Gaussian
 from estimators.laser import icp_covariance
 from estimators.laser.icp import (
-    LEAST_POINTS,
-    USUAL,
+    DEFAULT_RULES,
+    MIN_POINTS,
     Metric,
     PreparedScan,
     Registration,
@@ -84,7 +84,7 @@ class Match:
         known = np.eye(3) - self.loose
         return known @ self.motion.covariance @ known.T
 
-    def completed(self, guess: Gaussian) -> Gaussian:
+    def complete(self, guess: Gaussian) -> Gaussian:
         """In the directions that the scans do not hold, the guess and its covariance."""
         if self.loose is _NOTHING:
             return self.motion
@@ -95,7 +95,7 @@ class Match:
         return Gaussian(self.motion.mean - self.loose @ off, (covariance + covariance.T) / 2.0)
 
 
-def moved_beyond(motion: Array, distance_m: float, turn_rad: float) -> bool:
+def exceeds(motion: Array, distance_m: float, turn_rad: float) -> bool:
     """Whether a motion (3,) has left a key frame by more than either threshold."""
     x, y, turn = motion.tolist()
     return math.hypot(x, y) > distance_m or abs(turn) > turn_rad
@@ -130,7 +130,7 @@ class KeyFrameOptions:
 
     def left_key_frame(self, motion: Array) -> bool:
         """Whether a motion (3,) from the key frame calls for a new one."""
-        return moved_beyond(motion, self.keyframe_distance_m, self.keyframe_turn_rad)
+        return exceeds(motion, self.keyframe_distance_m, self.keyframe_turn_rad)
 
 
 @dataclass(frozen=True)
@@ -152,14 +152,14 @@ class ScanMatcher:
     @property
     def rules(self) -> Rules:
         """Which matches count, and when iterations end."""
-        return self.believed if isinstance(self.believed, Rules) else USUAL
+        return self.believed if isinstance(self.believed, Rules) else DEFAULT_RULES
 
     def prepare(self, ranges_m: ArrayLike, laser: Laser) -> PreparedScan | None:
         """Prepare a scan of this laser; None if it shows too little to be registered."""
         scan = prepare(ranges_m, laser.bearings_rad, laser.max_range_m)
         if self.most_gap_m is not None:
             scan = without_sparse_lines(scan, self.most_gap_m)
-        return scan if len(scan.points) >= LEAST_POINTS else None
+        return scan if len(scan.points) >= MIN_POINTS else None
 
     def match(
         self,
@@ -184,7 +184,7 @@ class ScanMatcher:
             Half the range of headings to search, where the guess knows nothing of the turn.
         """
         mount = laser.mount.pose
-        in_laser, _ = guess.seen_from(mount)
+        in_laser, _ = guess.in_sensor(mount)
         (xx, _, _), (_, yy, _), (_, _, turn) = in_laser.covariance.tolist()
         found = register(
             scan,
@@ -201,7 +201,7 @@ class ScanMatcher:
         R = self._covariance_of(
             found, scan, reference, in_laser.covariance, self.sigma_m(laser), rng
         )
-        motion, to_base = Gaussian(found.T_target_source, R).seen_from(se2.inverse(mount))
+        motion, to_base = Gaussian(found.T_target_source, R).in_sensor(se2.inverse(mount))
         if found.status != "degenerate":
             return Match(motion, found.status, _EVERYTHING, _NOTHING, found.overlap)
         directions = icp_covariance.split_directions(found)

@@ -68,7 +68,7 @@ class LikelihoodField:
 
     def draw(self, n: int, rng: np.random.Generator) -> Array:
         """Poses (n, 3), uniform over the free floor and all headings."""
-        require(len(self.free_cells) > 0, "the map has no floor off its walls to put particles on")
+        require(len(self.free_cells) > 0, "the map has no free cells in which to place particles")
         cells = self.free_cells[rng.integers(len(self.free_cells), size=n)]
         places: Array = self.origin_m + (cells[:, ::-1] + rng.random((n, 2))) * self.cell_m
         return np.column_stack([places, rng.uniform(-math.pi, math.pi, n)])
@@ -94,7 +94,7 @@ class LikelihoodField:
 
 @options("estimator")
 class FieldOptions:
-    """How beams are believed to end."""
+    """Options of the beam model (likelihood field)."""
 
     sigma_m: Positive = 0.2
     """Spread of beam ends about the walls, m: range noise, half a cell, and errors of the map."""

@@ -30,9 +30,9 @@ from estimators.on_a_map.likelihood_field import (
 from estimators.particles import (
     Scheme,
     effective_sample_size,
+    have_underflowed,
     normalize,
     resample,
-    underflowed,
 )
 from estimators.wheels import WheelOptions, WheelPrediction
 from sim import se2
@@ -90,7 +90,7 @@ class Bins:
         )
         self._shape: list[int] = shape.astype(int).tolist()
 
-    def of(self, poses: Array) -> Ints:
+    def number(self, poses: Array) -> Ints:
         """Number of the bin (M,) of each pose (M, 3); what lies off the map counts to its rim."""
         columns, rows, n_headings = self._shape
         x, y = ((poses[:, i] - self._origin_m[i]) / self._believed.bin_m for i in (0, 1))
@@ -99,9 +99,9 @@ class Bins:
         row = np.clip(y.astype(np.int64), 0, rows - 1)
         return np.asarray((row * columns + column) * n_headings + heading % n_headings)
 
-    def needed(self, poses: Array) -> int:
+    def count_particles(self, poses: Array) -> int:
         """Particles that the number of bins in use by poses (M, 3) calls for."""
-        k = np.count_nonzero(np.bincount(self.of(poses)))
+        k = np.count_nonzero(np.bincount(self.number(poses)))
         if k < 2:
             return 1
         a = 2.0 / (9.0 * (k - 1))
@@ -304,7 +304,7 @@ class Mcl(MclOptions):
                 poor = effective_sample_size(self._log_weights + middle * of_scan) < least
                 low, high = (low, middle) if poor else (middle, high)
             weights = self._log_weights + low * of_scan
-        return np.zeros(len(weights)) if underflowed(weights) else weights - np.max(weights)
+        return np.zeros(len(weights)) if have_underflowed(weights) else weights - np.max(weights)
 
     def _injected_share(self, of_scan: Array, n_beams: int) -> float:
         """Share of particles to inject: the short average of the fit against the long one.
@@ -321,7 +321,7 @@ class Mcl(MclOptions):
         return max(0.0, 1.0 - self._fast / (self.recovery_ratio * self._slow))
 
     def _yielded(self, ends: Floats) -> bool:
-        """Let rivals and defenders see the scan too; whether the belief has given way.
+        """Weight rivals and defenders by the scan; return whether the rivals took over.
 
         Both are as many, and are resampled alike at every scan: a wide cloud explains a scan worse
         than a narrow one at the same place. The scan that draws them does not count.
@@ -374,7 +374,7 @@ class Mcl(MclOptions):
             poses = self._poses[drawn]
             if n_injected > 0:
                 poses = np.concatenate([poses, self._drawn_by_scan(n_injected, ends, self._field)])
-            needed = min(max(self._bins.needed(poses), self.n_least), self.n_most)
+            needed = min(max(self._bins.count_particles(poses), self.n_least), self.n_most)
         self._poses, self._log_weights = self._jittered(poses), np.zeros(n)
         self._extras["injected"] = n_injected
 
@@ -382,7 +382,7 @@ class Mcl(MclOptions):
         """Belief of the weighted particles, and its extras."""
         weights = normalize(self._log_weights)
         poses = self._poses
-        bins = self._bins.of(poses)
+        bins = self._bins.number(poses)
         heaviest = bins == np.argmax(np.bincount(bins, weights))
         mean = weights[heaviest] @ poses[heaviest] / weights[heaviest].sum()
         for _ in range(2):

@@ -71,7 +71,7 @@ class GtsamBatch(GtsamBatchOptions):
         keys = map(model.pose_key, range(len(guess)))
         poses = np.array([model.planar(solved.atPose3(key)) for key in keys])
         marginals = gtsam.Marginals(graph, solved)
-        means, covariances = self._drive.filled_in(poses, self._joint(marginals, poses))
+        means, covariances = self._drive.fill_in(poses, self._joint(marginals, poses))
         converged = optimizer.iterations() < self.max_iterations
         return Estimate(
             stamps=self._drive.stamps,

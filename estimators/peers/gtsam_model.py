@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from estimators.base import Belief, Prior
-from estimators.gaussian import STILL, Gaussian, rotated
-from estimators.graph.landmark_drive import FLOOR, loosened, observed
+from estimators.gaussian import STILL, Gaussian, rotate
+from estimators.graph.landmark_drive import FLOOR, loosen, read_observations
 from estimators.landmarks.stereo import StereoModel, StereoOptions
 from estimators.peers import matrix_of, package
 from estimators.wheels import WheelOptions, WheelPrediction
@@ -148,7 +148,7 @@ class GtsamModel:
     def _noise(self, planar: Gaussian) -> Any:
         """Noise of a pose's tangent; it is in the axes of the pose itself."""
         covariance = np.diag(np.full(6, _FREE_SIGMA**2))
-        in_pose = rotated(planar.covariance, -float(planar.mean[2]))
+        in_pose = rotate(planar.covariance, -float(planar.mean[2]))
         covariance[np.ix_(_IN_PLANE, _IN_PLANE)] = in_pose
         return self._gtsam.noiseModel.Gaussian.Covariance(covariance)
 
@@ -190,9 +190,9 @@ class Isam2:
     def step(self, frame: Frame) -> tuple[Belief, Gaussian, tuple[Array, Ints] | None]:
         """Belief after a Frame, its motion as the graph takes it, and what its image shows."""
         motion = self._wheels.predict(frame)
-        loose = loosened(motion)
+        loose = loosen(motion)
         self.belief, self._motion = self.belief.then(motion), self._motion.then(loose)
-        seen, status = observed(frame, self._believed.stereo, self.camera, self._estimator)
+        seen, status = read_observations(frame, self._believed.stereo, self.camera, self._estimator)
         if seen is not None:
             self.belief, self._motion = self.see(self._motion, *seen), STILL
         extras = {"status": status} if status else {}

@@ -1,4 +1,4 @@
-"""A program of any language as an estimator: one JSON line a message, one line each in answer.
+"""An estimator in any language: a child process that replies to each JSON line with one.
 
 docs/programs.md is the protocol. The program never gets the truth: a message holds what a Frame
 does, and the first what the Prior does.
@@ -16,7 +16,7 @@ from estimators.programs.program import (
     ProgramError,
     ProgramOptions,
     Seconds,
-    apart,
+    explain_mismatch,
     map_message,
 )
 from sim.arrays import Array
@@ -90,7 +90,7 @@ class External(ExternalOptions):
             means = self._numbers(answer, "means", (len(stamps), 3))
             if not len(stamps) or (np.diff(stamps) <= 0.0).any():
                 raise self._wrong("must answer with stamps that increase, and some")
-            if why := apart(stamps, self._stamps):
+            if why := explain_mismatch(stamps, self._stamps):
                 raise self._wrong(f"must answer with stamps of the Frames; its path {why}")
             found = Estimate(stamps, means, covariances, "revised")
         assert self._program is not None
@@ -138,7 +138,7 @@ class External(ExternalOptions):
         if not sound_covariances(found.reshape(-1, 3, 3)).all():
             raise self._wrong(
                 f"must answer with {key}, symmetric and without a negative variance; leave out "
-                "what is not known"
+                "unknown values"
             )
         return found
 

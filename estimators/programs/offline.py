@@ -19,7 +19,7 @@ from estimators.programs.program import (
     ProgramError,
     ProgramOptions,
     Seconds,
-    apart,
+    explain_mismatch,
     map_message,
 )
 from sim import se2
@@ -29,9 +29,9 @@ from sim.formats.carmen import write_carmen
 from sim.formats.rosbag_out import write_bag
 from sim.formats.trajectory import read_track
 from sim.options import options
-from sim.recording import Frame, Recording, WheelLog, joined, save
+from sim.recording import Frame, Recording, WheelLog, log_of_readings, save
 from sim.robot.arc import arc_increment
-from sim.worlds.grid import OccupancyGrid, rasterized
+from sim.worlds.grid import OccupancyGrid, rasterize
 from sim.worlds.grid_file import write_grid
 from sim.worlds.world import World
 
@@ -123,7 +123,7 @@ class Offline(OfflineOptions):
             except InputError as error:
                 text = str(error).replace(str(out), "{out}")
                 raise ProgramError(f"{program.name} wrote no trajectory: {text}") from error
-        if why := apart(track.stamps, [frame.stamp for frame in self._frames]):
+        if why := explain_mismatch(track.stamps, [frame.stamp for frame in self._frames]):
             raise ProgramError(f"{program.name} wrote no trajectory of this log: {{out}} {why}")
         return Estimate(track.stamps, track.means, track.covariances, self.kind)
 
@@ -149,7 +149,7 @@ class Offline(OfflineOptions):
         """The known map as free, occupied and unknown cells, which every map server reads."""
         known_map = self._prior.map
         if isinstance(known_map, World):
-            return rasterized(known_map, _CELL_M, self._laser.mount.z_m)
+            return rasterize(known_map, _CELL_M, self._laser.mount.z_m)
         return cast(OccupancyGrid, known_map)
 
     def _map_file(self) -> tuple[str, Callable[[Path], object]]:
@@ -185,6 +185,6 @@ def recording_of(frames: Sequence[Frame], prior: Prior) -> Recording:
         if seen:
             readings = [frame.readings[name] for frame in seen]
             schema = {key: field for key, field in sensor.schema.items() if key in readings[0]}
-            logs[name] = joined(schema, np.array([f.stamp for f in seen]), readings, name)
+            logs[name] = log_of_readings(schema, np.array([f.stamp for f in seen]), readings, name)
     wheels = WheelLog(stamps, travel_m)
     return Recording(stamps.copy(), wheels, prior.robot, prior.sensors, logs)

@@ -267,7 +267,7 @@ def map_message(known_map: Any) -> dict[str, Any] | None:
     )
 
 
-def apart(stamps: Array, frame_stamps: Sequence[float]) -> str:
+def explain_mismatch(stamps: Array, frame_stamps: Sequence[float]) -> str:
     """Why an answer's stamps are not those of the Frames; empty if they overlap."""
     first, last = frame_stamps[0], frame_stamps[-1]
     if stamps[0] <= last and stamps[-1] >= first:

@@ -172,7 +172,7 @@ def retrieval(distances: ArrayLike, offsets_m: ArrayLike, within_m: float) -> di
     offsets_m
         (Q, N) true distances between query and node, m.
     within_m
-        A node this near is a right answer. Queries without one are left out.
+        A node within this distance is a correct match. Queries without one are left out.
 
     Returns
     -------

@@ -45,14 +45,14 @@ def node_log_weights(
     away = (nodes_m[:, :1] - nearest_m[:, 0]) ** 2 + (nodes_m[:, 1:] - nearest_m[:, 1]) ** 2
     exponents = away / -(sigma_l_m**2)
     if weighting != "M1":
-        exponents -= (scaled(descriptor_distances) / sigma_m) ** 2
+        exponents -= (scale(descriptor_distances) / sigma_m) ** 2
     if weighting == "M3":
         return np.asarray(exponents.sum(axis=1))
     highest = exponents.max(axis=1)
     return np.asarray(highest + np.log(np.exp(exponents - highest[:, None]).sum(axis=1)))
 
 
-def scaled(distances: Array) -> Array:
+def scale(distances: Array) -> Array:
     """Scale distances (B,) to sum to one; those that are all zero stay so."""
     total = float(distances.sum())
     return distances / total if total > 0.0 else distances

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from estimators.gaussian import rotated
+from estimators.gaussian import rotate
 from estimators.laser.icp import PreparedScan, Registration, prepare, register
 from estimators.laser.icp_covariance import censi
 from estimators.topological.topological_map import TopologicalMap, level_slice
@@ -58,7 +58,7 @@ class Refiner:
         for candidate in [node, *others]:
             if not math.isfinite(self._map.headings_rad[candidate]):
                 continue
-            for turn in likely_turns_rad(ranges, self._map.slices_m[candidate]):
+            for turn in find_turns_rad(ranges, self._map.slices_m[candidate]):
                 found = register(
                     source,
                     self._target(candidate),
@@ -91,7 +91,7 @@ class Refiner:
         at_node = np.append(self._map.positions_m[node], self._map.headings_rad[node])
         T_map_lidar = se2.compose(at_node, se2.compose(mount, found.T_target_source))
         heading = float(se2.compose(at_node, mount)[2])
-        R = rotated(censi(found, source, self._prepared[node]), heading)
+        R = rotate(censi(found, source, self._prepared[node]), heading)
         back = se2.inverse(mount)
         by_lidar = se2.compose_jacobians(T_map_lidar, back)[0]
         covariance = by_lidar @ R @ by_lidar.T
@@ -100,7 +100,7 @@ class Refiner:
         return Refinement(pose, (covariance + covariance.T) / 2.0, "ok")
 
 
-def likely_turns_rad(source_m: Floats, target_m: Floats, n_turns: int = _TURNS) -> list[float]:
+def find_turns_rad(source_m: Floats, target_m: Floats, n_turns: int = _TURNS) -> list[float]:
     """Headings of the source in the target's frame at which their outlines are most alike.
 
     Peaks of the circular correlation of inverse ranges (A,), which count near walls most and

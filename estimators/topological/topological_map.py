@@ -1,6 +1,6 @@
 """A topological map: places with a position, a descriptor and neighbours (maximo2024, sec. 2.2).
 
-It is built from a mapping run, or from arrays of one's own, and kept as an `.npz` without pickles.
+It is built from a mapping run, or from your own arrays, and stored as an `.npz` without pickles.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class TopologicalMap:
         may fall into parts.
     descriptor
         What made the descriptors: a name of `estimators.topological.descriptors.KINDS`, or empty
-        for a network of one's own, compared by Euclidean distance.
+        for your own network, compared by Euclidean distance.
     headings_rad
         (N,) heading of base_link at each node; NaN where it is not known.
     slices_m
@@ -106,7 +106,7 @@ class TopologicalMap:
         lengths = np.hypot(*(ends[:, 1] - ends[:, 0]).T)
         return float(np.median(lengths[lengths > 0.0])) if np.any(lengths > 0.0) else 0.0
 
-    def moved(self, T_new_old: Array) -> TopologicalMap:
+    def transform(self, T_new_old: Array) -> TopologicalMap:
         """Return the map as seen from another map frame."""
         return dataclasses.replace(
             self,

@@ -13,7 +13,7 @@ import numpy as np
 from estimators.base import Belief, Prior
 from estimators.particles import Scheme, effective_sample_size, resample
 from estimators.topological import descriptors as describers
-from estimators.topological.node_weights import Weighting, node_log_weights, scaled
+from estimators.topological.node_weights import Weighting, node_log_weights, scale
 from estimators.topological.place_refinement import Refiner
 from estimators.topological.topological_map import Edges, TopologicalMap, load
 from sim import se2
@@ -223,7 +223,7 @@ class TopologicalMcl(TopologicalMclOptions):
         n_new = rng.binomial(n, self.injection) if self.injection > 0.0 else 0
         if n_new:
             slots = rng.choice(n, n_new, replace=False)
-            unlike = 0.0 * away if self.weighting == "M1" else scaled(away) / self.sigma_m
+            unlike = 0.0 * away if self.weighting == "M1" else scale(away) / self.sigma_m
             node = nearest[resample(-(unlike**2), n_new, rng, "multinomial")]
             out = (rng.random(n_new) * self._graph.degree[node]).astype(np.int64)
             self._edge[slots] = self._graph.first_out[node] + out

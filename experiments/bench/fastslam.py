@@ -13,7 +13,7 @@ from estimators.landmarks import particle_kernels as ekf
 from estimators.landmarks.fastslam import FastSLAM
 from estimators.landmarks.particle_maps import LandmarkMaps
 from estimators.landmarks.stereo import StereoModel
-from experiments.bench.measure import Measurement, median_time_s, timed_steps
+from experiments.bench.measure import Measurement, median_time_s, time_steps
 from experiments.evaluation.statistics import log_log_slope
 from experiments.runs.evaluate import run_over
 from sim.arrays import Array
@@ -44,7 +44,7 @@ def run_steps(
     estimator = FastSLAM(n_particles=n_particles, kr=_K_M, kl=_K_M, **options)
     run_over(recording.cut(40), estimator, prior, np.random.default_rng(0))
     estimator.reset(prior, np.random.default_rng(0))
-    steps = timed_steps(estimator, recording.frames())
+    steps = time_steps(estimator, recording.frames())
     seconds, resampled = np.array([(s, belief.extras["resampled"]) for s, belief in steps]).T
     return seconds, float(resampled.mean()), estimator.bytes_per_particle
 

@@ -30,7 +30,7 @@ from estimators.laser.scan_matching import MatcherOptions, ScanMatcher
 from experiments.bench.growth import resident_mib
 from experiments.bench.measure import Measurement, time_s
 from experiments.evaluation.metrics import score, travelled_m
-from experiments.runs.evaluate import limited_blas
+from experiments.runs.evaluate import limit_blas
 from experiments.runs.experiment import Experiment
 from experiments.runs.seeds import stream
 from sim import se2
@@ -65,7 +65,7 @@ _LASER = Laser(n_beams=181, fov_rad=math.pi)
 _JUDGED = range(1100, 1120)  # seeds 1000 to 1012 have been looked at
 
 
-class Planted(GraphSlam):
+class GraphSlamWithFalseClosures(GraphSlam):
     """Graph SLAM to whose candidates false ones are added, this share of all."""
 
     def __init__(self, share: float, chance: np.random.Generator, **options: Any) -> None:
@@ -73,9 +73,9 @@ class Planted(GraphSlam):
         self._share, self._chance = share, chance
         self.false: list[Edge] = []
 
-    def proposed(self) -> list[Edge]:
+    def propose_closures(self) -> list[Edge]:
         """True candidates and planted ones."""
-        found = super().proposed()
+        found = super().propose_closures()
         number = self._chance.poisson(len(found) * self._share / (1.0 - self._share))
         newest = len(self.graph) - 1
         for _ in range(number):
@@ -111,7 +111,7 @@ def run() -> Iterator[Measurement]:
         note = f"of {total['planted']:g}; false candidates are {share:.0%} of all"
         name = f"graph_slam.false_of_planted_{share:.0%}"
         yield Measurement(name, total["false"], "", 0, note=note)
-    with limited_blas():
+    with limit_blas():
         yield from _grow(stream(0, "bench"))
 
 
@@ -128,9 +128,9 @@ def run_rooms(seed: int, planted: float = 0.0) -> dict[str, float]:
     """
     experiment = Experiment.compose([*_ROOMS, f"seed={seed}"])
     recording, robot = experiment.recording(), experiment.robot()
-    estimator = Planted(planted, stream(seed, "bench"), kr=robot.kr, kl=robot.kl)
+    estimator = GraphSlamWithFalseClosures(planted, stream(seed, "bench"), kr=robot.kr, kl=robot.kl)
     prior, rng = experiment.prior(recording), stream(seed, "estimator/graph_slam")
-    with limited_blas():
+    with limit_blas():
         begun = time.process_time()
         online = run_estimator(estimator, recording, prior, rng)
         seconds = time.process_time() - begun
@@ -145,7 +145,7 @@ def run_rooms(seed: int, planted: float = 0.0) -> dict[str, float]:
     }
 
 
-def _judge_closures(estimator: Planted, recording: Recording) -> dict[str, int]:
+def _judge_closures(estimator: GraphSlamWithFalseClosures, recording: Recording) -> dict[str, int]:
     closures = estimator.graph.closures
     stamps = np.nan_to_num(estimator.node_stamps, nan=recording.frame_stamps[0])
     truth = recording.truth_at(stamps)

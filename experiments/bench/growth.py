@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import Any
 
 from estimators.base import Belief
-from experiments.bench.measure import Measurement, alone, peak_mib, time_s, timed_steps
-from experiments.runs.evaluate import limited_blas
+from experiments.bench.measure import Measurement, alone, peak_mib, time_s, time_steps
+from experiments.runs.evaluate import limit_blas
 from experiments.runs.experiment import Experiment
 from experiments.runs.seeds import stream
 
@@ -58,7 +58,7 @@ _FINISHED = (5, 10, 20, 30)  # minutes after which the whole path is solved for
 def run() -> Iterator[Measurement]:
     """Step and memory at the end of the drive beside those at its beginning; times of `finish`."""
     for name in (*_IN_ROOMS, *_ON_CAMPUS):
-        step_us, memory_mib = alone(driven, name)[0]
+        step_us, memory_mib = alone(measure_drive, name)[0]
         parts = step_us[1:4], step_us[_SETTLED : _SETTLED + 3], step_us[-3:]
         early, middle, late = map(statistics.median, parts)
         note = f"at the end; {early:.0f} in minutes 2-4, {middle:.0f} in 7-9"
@@ -66,12 +66,12 @@ def run() -> Iterator[Measurement]:
         grown_mib, note = memory_mib[-1] - memory_mib[_SETTLED], "since the end of minute 7"
         yield Measurement(f"growth.{name}.memory_mib", grown_mib, "MiB", note=note)
     for name in _WITH_FINISH:
-        for minutes, (seconds, peak) in alone(finished, name)[0].items():
+        for minutes, (seconds, peak) in alone(measure_finish, name)[0].items():
             note = f"peak {peak:.0f} MiB"
             yield Measurement(f"growth.{name}.finish_{minutes}min_s", seconds, "s", note=note)
 
 
-def driven(name: str) -> tuple[list[float], list[float]]:
+def measure_drive(name: str) -> tuple[list[float], list[float]]:
     """Mean processor time of a step in each minute, µs, and memory after it, MiB."""
     minutes = [
         (1e6 * statistics.fmean(seconds for seconds, _ in steps), resident_mib())
@@ -81,7 +81,7 @@ def driven(name: str) -> tuple[list[float], list[float]]:
     return step_us, memory_mib
 
 
-def finished(name: str) -> dict[int, tuple[float, float]]:
+def measure_finish(name: str) -> dict[int, tuple[float, float]]:
     """Processor time of `finish`, s, and the most memory so far, MiB, by the minutes driven."""
     costs = {}
     for minute, (estimator, steps) in enumerate(_minutes(name), start=1):
@@ -101,9 +101,9 @@ def _minutes(name: str) -> Iterator[tuple[Any, Iterator[tuple[float, Belief]]]]:
     prior, estimator = experiment.prior(recording), experiment.estimator()
     estimator.reset(prior, stream(0, "bench"))
     by_minute = itertools.groupby(recording.frames(), lambda frame: int(frame.stamp // 60.0))
-    with limited_blas():
+    with limit_blas():
         for _, frames in itertools.islice(by_minute, _MINUTES):
-            yield estimator, timed_steps(estimator, frames)
+            yield estimator, time_steps(estimator, frames)
 
 
 def resident_mib() -> float:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from estimators.base import Prior
 from estimators.on_a_map.likelihood_field import FieldOptions, beam_ends, likelihood_field
 from estimators.on_a_map.mcl import Mcl
-from experiments.bench.measure import Measurement, median_time_s, timed_steps
+from experiments.bench.measure import Measurement, median_time_s, time_steps
 from experiments.runs.seeds import stream
 from sim import se2
 from sim.arrays import Array
@@ -107,7 +107,7 @@ def _updates(world: World, poses: Array, frames: list[Frame]) -> tuple[float, fl
         estimator.reset(prior, np.random.default_rng(0))
         steps = [
             (seconds, belief.extras["ess"], *(belief.mean - pose)[:2])
-            for pose, (seconds, belief) in zip(poses, timed_steps(estimator, frames), strict=True)
+            for pose, (seconds, belief) in zip(poses, time_steps(estimator, frames), strict=True)
         ]
     seconds, ess, *off_m = np.array(steps).T
     if np.hypot(*off_m).max() > 0.5:

@@ -12,7 +12,7 @@ from multiprocessing import get_context
 from typing import Any, Literal, TypeVar
 
 from estimators.base import Belief, Estimator
-from experiments.runs.version import machine
+from experiments.runs.version import describe_machine
 from sim.recording import Frame
 
 T = TypeVar("T")
@@ -107,7 +107,7 @@ def peak_mib() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
 
 
-def timed_steps(estimator: Estimator, frames: Iterable[Frame]) -> Iterator[tuple[float, Belief]]:
+def time_steps(estimator: Estimator, frames: Iterable[Frame]) -> Iterator[tuple[float, Belief]]:
     """Step through frames; yield each step's processor time, s, and its belief."""
     for frame in frames:
         begun = time.process_time()
@@ -117,7 +117,9 @@ def timed_steps(estimator: Estimator, frames: Iterable[Frame]) -> Iterator[tuple
 
 def as_json(results: list[Measurement]) -> str:
     """One object: the machine, and the results in order."""
-    return json.dumps({"machine": machine(), "results": [vars(r) for r in results]}, indent=2)
+    return json.dumps(
+        {"machine": describe_machine(), "results": [vars(r) for r in results]}, indent=2
+    )
 
 
 def as_table(results: list[Measurement]) -> str:
@@ -130,7 +132,7 @@ def as_table(results: list[Measurement]) -> str:
         Column("value", justify="right", no_wrap=True),
         Column("goal", justify="right", no_wrap=True),
         *("unit", "", "note"),
-        title=", ".join(f"{key} {value}" for key, value in machine().items()),
+        title=", ".join(f"{key} {value}" for key, value in describe_machine().items()),
     )
     words = {None: "", True: "reached", False: "MISSED"}
     for r in results:

@@ -9,7 +9,7 @@ from estimators.base import run as run_estimator
 from estimators.graph.least_squares import solve
 from estimators.graph.smoother import Smoother
 from experiments.bench.measure import Measurement, median_time_s
-from experiments.runs.evaluate import limited_blas
+from experiments.runs.evaluate import limit_blas
 from experiments.runs.experiment import Experiment
 from experiments.runs.seeds import stream
 
@@ -43,7 +43,7 @@ def run() -> Iterator[Measurement]:
         ("ekf_slam.run_s", steps("ekf_slam"), 3, 0.35, whole),
         ("fixed_lag.run_s", steps("fixed_lag"), 3, 0.3, whole),
     )
-    with limited_blas():
+    with limit_blas():
         for name, call, repeats, goal, note in timed:
             seconds = median_time_s(call, at_least_s=0.0, repeats=repeats, clock=time.process_time)
             yield Measurement(name, seconds, "s", goal, note=note)

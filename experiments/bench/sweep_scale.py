@@ -21,7 +21,7 @@ from experiments.runs.experiment import Experiment
 from experiments.runs.row import Row, Status
 from experiments.sweeps import launch, work
 from experiments.sweeps.collect import collect
-from experiments.sweeps.plan import Family, packed, plan_of
+from experiments.sweeps.plan import Family, make_plan, pack_jobs
 from experiments.sweeps.summary import summary
 
 _NAME = "bench_sweep_scale"
@@ -68,14 +68,14 @@ def run() -> list[Measurement]:
 def _planned() -> tuple[float, list[Path]]:
     """Seconds from the arguments to the jobs' shares, and these."""
     begun = time.perf_counter()
-    plan = plan_of(_SWEEP)
+    plan = make_plan(_SWEEP)
     runs = np.arange(len(plan.keys))
     launch.check(plan, runs)
     jobs = launch.Jobs(plan.experiment(0).rows_folder, _N_JOBS)
-    for part in packed(plan.recordings, jobs.count):
+    for part in pack_jobs(plan.recordings, jobs.count):
         jobs.add(plan, part)
     seconds = time.perf_counter() - begun
-    return seconds, [work.share_of(jobs.plan, number) for number in range(len(jobs.sizes))]
+    return seconds, [work.share_path(jobs.plan, number) for number in range(len(jobs.sizes))]
 
 
 def _written(share: Path) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 
 from estimators.base import Prior, TeamEstimator
 from experiments.bench.measure import Measurement
-from experiments.runs.evaluate import limited_blas
+from experiments.runs.evaluate import limit_blas
 from experiments.runs.experiment import Experiment
 from sim.arrays import Array
 from sim.team import Team
@@ -36,7 +36,7 @@ def run() -> list[Measurement]:
 def _measure(name: str, size: int, whole: Team) -> Iterator[Measurement]:
     experiment = Experiment.compose([*_DRIVE, *_ARMS[name], f"team.size={size}"])
     team = whole.first(size)
-    with limited_blas():
+    with limit_blas():
         spent_ms = 1e3 * instant_s(experiment.team_estimator(), team, experiment.priors(team))
     where, (median, last) = f"teams.{name}.robots_{size}", np.quantile(spent_ms, [0.5, 0.99])
     yield Measurement(f"{where}_ms", float(median), "ms", note="median of an instant")

@@ -93,7 +93,7 @@ def from_end_poses(
     rolled = sum(np.abs(m.profile).sum(axis=0) for m in manoeuvres)
     require(
         not geometry or np.all(rolled > 0.0),
-        "wheel gains and track take both straights and turns to tell apart; add what is missing",
+        "wheel gains and track need both straights and turns; add the missing kind",
     )
     models = [
         EndPoseModel(

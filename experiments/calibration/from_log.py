@@ -18,7 +18,7 @@ from experiments.calibration.reference import (
     Source,
     names_of,
     reference_of,
-    registered,
+    register_scans,
     spaced_rows,
     wheel_delay_s,
 )
@@ -60,7 +60,7 @@ class Residuals:
 
 
 @dataclass(frozen=True)
-class Found:
+class LogCalibration:
     """A calibration, with the 95 % interval of each number by name, and what is left.
 
     Attributes
@@ -86,7 +86,7 @@ class Found:
         return "\n".join(lines)
 
 
-def calibrate_log(recording: Recording, until_s: float | None = None) -> Found:
+def calibrate_log(recording: Recording, until_s: float | None = None) -> LogCalibration:
     """Calibrate a robot by the first `until_s` of a log, or by all of it.
 
     Raises
@@ -98,7 +98,7 @@ def calibrate_log(recording: Recording, until_s: float | None = None) -> Found:
     return calibrate_against(reference_of(part), part)
 
 
-def calibrate_against(reference: Reference, part: Recording) -> Found:
+def calibrate_against(reference: Reference, part: Recording) -> LogCalibration:
     """Calibrate a robot by a log whose reference is at hand.
 
     Raises
@@ -156,7 +156,7 @@ def calibrate_against(reference: Reference, part: Recording) -> Found:
                 interval = Interval(float(value), known.low + float(by), known.high + float(by))
                 intervals[f"sensors.{name}.{key}"] = interval
         # a truth errs from scan to scan by more than the laser does
-        scans = reference if by_scans else registered(part, name)
+        scans = reference if by_scans else register_scans(part, name)
         noise, share, left = laser_noise(part, name, scans)
         sensors[name] = dataclasses.replace(found, sigma_range_m=noise.value)
         intervals |= {f"sensors.{name}.sigma_range_m": noise, f"{name}: outliers": share}
@@ -164,7 +164,7 @@ def calibrate_against(reference: Reference, part: Recording) -> Found:
         name = cameras[0]
         sensors[name], of_camera, left = camera_noise(part, name, reference)
         intervals |= of_camera
-    return Found(
+    return LogCalibration(
         reference.source,
         Calibration(wheels, slip, sensors),
         intervals,

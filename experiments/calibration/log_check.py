@@ -1,4 +1,4 @@
-"""What is odd about a log: clocks, gaps, and sensors that do not agree with the motion."""
+"""Warnings about a log: clocks, gaps, and sensors that disagree with the motion."""
 
 import math
 

@@ -17,7 +17,7 @@ from experiments.evaluation.statistics import Interval
 from sim import se2
 from sim.arrays import Array
 from sim.errors import require
-from sim.formats.assemble import chained
+from sim.formats.assemble import chain_motions
 from sim.formats.khepera import WheelLaserLog
 from sim.formats.lego import GEOMETRIC_TRACK_M, SCANNER_AHEAD_M, TICK_M, TickLog
 from sim.robot.arc import arc_increment
@@ -231,7 +231,7 @@ def axle_at(scanner_m: Array, heading_rad: float) -> Array:
 def scanner_positions(log: TickLog, tick_m: float, track_m: float, start: Array) -> Array:
     """Positions (N, 2) of the scanner by dead reckoning of the axle from a start pose (3,)."""
     steps = arc_increment(np.diff(log.ticks, axis=0) * tick_m, track_m)
-    axle = se2.compose(start, chained(steps))
+    axle = se2.compose(start, chain_motions(steps))
     return se2.compose(axle, np.array([SCANNER_AHEAD_M, 0.0, 0.0]))[:, :2]
 
 

@@ -1,4 +1,4 @@
-"""What a log's wheels are compared with: its truth, else its scans, else its landmarks."""
+"""The reference for a log's wheels: its truth, else its scans, else its landmarks."""
 
 import math
 from dataclasses import dataclass
@@ -72,7 +72,7 @@ def reference_of(recording: Recording) -> Reference:
         if dense or not lasers:
             return Reference(Source.TRUTH, stamps, poses, np.diff(stamps) <= _LONGEST_GAP_S)
     if lasers:
-        return registered(recording, lasers[0])
+        return register_scans(recording, lasers[0])
     require(cameras, "the log has no truth, no scans and no landmarks to compare its wheels with")
     name = cameras[0]
     prior = Prior(recording.robot, recording.sensors, np.zeros(3), _START)
@@ -86,7 +86,7 @@ def reference_of(recording: Recording) -> Reference:
     )
 
 
-def registered(recording: Recording, name: str) -> Reference:
+def register_scans(recording: Recording, name: str) -> Reference:
     """Poses of a laser by registering each of its scans to the one before.
 
     What moves is the laser, as the log has its mount on the robot.

@@ -148,7 +148,7 @@ def laser_noise(
     error, distance = np.concatenate(errors), np.concatenate(distances)
     finite = np.isfinite(error)
     error, distance = error[finite], distance[finite]
-    require(len(error) >= 100, "too few beams of neighbouring scans meet to tell their noise")
+    require(len(error) >= 100, "too few beams of consecutive scans overlap to estimate noise")
     spread = MAD * float(np.median(np.abs(error)))
     fits = np.abs(error) < _OUTLIER * spread
     # a beam, and the mean of two about half of the time

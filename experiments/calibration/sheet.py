@@ -80,7 +80,7 @@ def read_sheet(path: Path) -> tuple[dict[str, tuple[float, float, float]], dict[
             require(abs(value) <= most, f"{where}: {name} must be at most {most:g}, got {value:g}")
         require(
             duration_s > 0.0 and (v, omega) != (0.0, 0.0),
-            f"{where}: the command must move the robot for a time; leave out what does not",
+            f"{where}: the command must move the robot; remove rows that do not",
         )
         command = commands.setdefault(case, (v, omega, duration_s))
         require(
@@ -91,13 +91,13 @@ def read_sheet(path: Path) -> tuple[dict[str, tuple[float, float, float]], dict[
     require(commands, f"{path}: holds no run; its columns are {','.join(COLUMNS)}")
     turns = {case: omega * duration_s for case, (_, omega, duration_s) in commands.items()}
     poses = {case: np.array(rows) for case, rows in ends.items()}
-    headings = unwrapped([pose[:, 2] for pose in poses.values()], list(turns.values()))
+    headings = unwrap_headings([pose[:, 2] for pose in poses.values()], list(turns.values()))
     for pose, heading in zip(poses.values(), headings, strict=True):
         pose[:, 2] = heading
     return commands, poses
 
 
-def unwrapped(headings: Sequence[Array], turns: Sequence[float]) -> list[Array]:
+def unwrap_headings(headings: Sequence[Array], turns: Sequence[float]) -> list[Array]:
     """Add whole turns to the headings (n,) of each case that were wrapped.
 
     The cases with a commanded turn below pi say how far the robot turns for what it is commanded:

@@ -34,7 +34,7 @@ def info(
     from sim.formats.detect import read_all
 
     robots = read_all(log, robot).robots
-    require(len(robots) == 1 or not check, "--check takes one robot; name it by --robot")
+    require(len(robots) == 1 or not check, "--check takes one robot; choose it with --robot")
     for number, own in enumerate(robots):
         show(describe(own) if len(robots) == 1 else f"robot {number}\n{describe(own)}\n")
     if check:
@@ -89,7 +89,7 @@ def convert(
 
 @dataclass(frozen=True)
 class EndPoses:
-    """What a robot is calibrated by, in place of its wheels' true travel."""
+    """Alternatives to the wheels' true travel as a reference for calibration."""
 
     sheet: Annotated[
         Path | None,

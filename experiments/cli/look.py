@@ -1,4 +1,4 @@
-"""Commands that show what there is: options, view, map."""
+"""Commands that display options, runs and maps: options, view, map."""
 
 from __future__ import annotations
 
@@ -147,7 +147,7 @@ def view(
       estima view --map map.yaml -o map.png
     """
     from experiments.runs.compose import searched
-    from experiments.sweeps.again import draw_again, row_of
+    from experiments.sweeps.again import draw_recorded_run, row_of
     from experiments.viewing import play
 
     if world or (grid is not None and not what):
@@ -164,7 +164,7 @@ def view(
     if not Path(first).exists() and (row := row_of(first)) is not None:
         own = "a run of a sweep has its estimator and its settings; leave out others"
         require(estimate is None and not overrides, f"{first}: {own}")
-        said = draw_again(row, how, first, config_dir)
+        said = draw_recorded_run(row, how, first, config_dir)
     else:
         ran = estimate is not None or not overrides
         require(ran, f"{[*overrides, ''][0]}: overrides need an estimator; add --estimate NAME")

@@ -12,7 +12,7 @@ import typer
 
 from experiments.cli import logs, look, project, run, score, tables
 from experiments.cli.flags import PASS_ON
-from experiments.runs.console import end
+from experiments.runs.console import exit_with
 from experiments.runs.version import code_version
 from sim.errors import InputError
 
@@ -90,10 +90,10 @@ def main() -> None:
     try:
         app(_results_first(sys.argv[1:]))
     except (Exception, KeyboardInterrupt) as error:
-        end(error)
+        exit_with(error)
     except SystemExit as ended:
         if ended.code == _INTERRUPTED:  # Typer has caught the interrupt, which may hold a message
-            end(ended)
+            exit_with(ended)
         raise
 
 

@@ -15,7 +15,7 @@ def reproduce(
     full: Annotated[bool, typer.Option("--full", help="The judged profile.")] = False,
     paper: Annotated[str | None, typer.Option(help="Only this paper.")] = None,
     figures_only: Annotated[
-        bool, typer.Option("--figures-only", help="Draw again what is in results/.")
+        bool, typer.Option("--figures-only", help="Redraw the figures from the tables in results/.")
     ] = False,
 ) -> None:
     """Make the papers' figures, tables and claims, in results/quick/ or, in full, in results/.

@@ -38,7 +38,7 @@ class Matching:
 
 
 @dataclass(frozen=True)
-class Made:
+class Origin:
     """How the trajectories were made."""
 
     revised: Annotated[
@@ -59,11 +59,11 @@ def score(
     recording: Annotated[Path, typer.Argument(help="A recording (.npz) or a log with its truth.")],
     trajectories: Annotated[
         list[Path],
-        typer.Argument(help="What programs made of it: .tum, .csv of ours, .mcap, .bag."),
+        typer.Argument(help="Estimated trajectories: .tum, our .csv, .mcap, .bag."),
     ],
     *,
     matching: Matching,
-    made: Made,
+    made: Origin,
     name: Annotated[str, typer.Option(help="Folder of the rows in results/runs.")] = "score",
     as_json: Annotated[bool, typer.Option("--json", help="Print the rows as JSON.")] = False,
 ) -> None:

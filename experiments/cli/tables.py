@@ -76,7 +76,7 @@ def table(
 ) -> None:
     """Show a sweep's mean errors with 95 % intervals, or write them for a paper.
 
-    Errors are those of the best answers: of the revised path of a method that has one. The best on
+    Errors are those of each method's best path: the revised one if it has one. The best on
     the same recordings is bold. A .tex file goes into a LaTeX article by `input` as it is; what is
     too wide for one table becomes several.
 
@@ -105,7 +105,7 @@ def table(
 
 @dataclass(frozen=True)
 class Axes:
-    """What is drawn against what."""
+    """Axes, series and panels of a plot."""
 
     x: Annotated[
         str | None,

@@ -55,7 +55,7 @@ def alignment(truth: Array, means: Array) -> Array:
     return np.array([*(centre_truth - rotated), angle])
 
 
-def aligned(truth: Array, means: Array) -> Array:
+def align(truth: Array, means: Array) -> Array:
     """Estimated poses (T, 3) after `alignment`."""
     return se2.compose(alignment(truth, means), means)
 
@@ -113,7 +113,7 @@ def in_ellipse(truth: Array, mean: Array, covariance: Array) -> bool:
     """Whether a true position lies in the 95 % ellipse of a pose's (3,) covariance (3, 3).
 
     puzzlebot2024 asks it of the real robot and the ideal one's ellipse. That of a singular
-    covariance, as of particles that are all alike, is a line or a point, and holds nothing.
+    covariance, as of identical particles, is a line or a point, and contains nothing.
     """
     off, block = truth[:2] - mean[:2], covariance[:2, :2]
     if np.linalg.matrix_rank(block, hermitian=True) < 2:
@@ -191,7 +191,7 @@ def path_scores(truth: Array, means: Array, covariances: Array) -> dict[str, flo
 
     Covariances that are all zeros are unknown: their scores are left out.
     """
-    fitted, off = aligned(truth, means), position_errors_m(truth, means)
+    fitted, off = align(truth, means), position_errors_m(truth, means)
     values = nees(truth, means, covariances)
     counted = np.isfinite(values)
     row = {

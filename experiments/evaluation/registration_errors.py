@@ -31,7 +31,7 @@ class ScanScene:
     T_w_source: Array
 
 
-def scenes(
+def sample_scenes(
     world: World, place: str, mount: Array, rng: np.random.Generator, n: int
 ) -> list[ScanScene]:
     """Poses of the laser along the world's tour inside a place, 5 cm and up to 3 degrees apart."""
@@ -48,7 +48,7 @@ def scenes(
     return found
 
 
-def measured(
+def measure(
     scene: ScanScene, laser: Laser, rng: np.random.Generator, n_repeats: int, n_sampled: int
 ) -> pd.DataFrame:
     """Rows (metric x method): NEES over dof, determinants, errors, bias along the motion, times.

@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from experiments.evaluation.time_sync import Rows, interpolate, nearest
+from experiments.evaluation.time_sync import Rows, interpolate, nearest_rows
 from sim import se2
 from sim.arrays import Array
 from sim.errors import require
@@ -74,7 +74,7 @@ def relation_errors(
     stamps, poses = stamps[order], poses[order]
     require(len(stamps) >= 2, "relations need a trajectory of at least two poses")
     if association == "near":
-        rows = nearest(stamps, relations.stamps)
+        rows = nearest_rows(stamps, relations.stamps)
         known = np.all(np.abs(stamps[rows] - relations.stamps) <= tolerance_s, axis=1)
         ends = poses[rows]
     else:

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from experiments.evaluation.metrics import aligned, position_errors_m, rms
+from experiments.evaluation.metrics import align, position_errors_m, rms
 from sim import se2
 from sim.arrays import Array
 from sim.errors import require
@@ -11,7 +11,7 @@ from sim.errors import require
 Rows = NDArray[np.int64]
 
 
-def nearest(stamps: Array, wanted: Array) -> Rows:
+def nearest_rows(stamps: Array, wanted: Array) -> Rows:
     """Row of the stamp nearest to each wanted one (the earlier of two); stamps increasing."""
     if len(stamps) < 2:
         return np.zeros(np.shape(wanted), np.int64)
@@ -50,4 +50,4 @@ def aligned_ate_m(
     estimate = interpolate(stamps, poses, truth_stamps, longest_gap_s)
     known = np.isfinite(estimate).all(axis=1)
     require(known.sum() >= 3, "fewer than three true poses lie within the estimate's time span")
-    return rms(position_errors_m(truth[known], aligned(truth[known], estimate[known])))
+    return rms(position_errors_m(truth[known], align(truth[known], estimate[known])))

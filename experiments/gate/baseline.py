@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from experiments.gate.candidate import candidate_rows
-from experiments.gate.compare import WHICH, Finding, compare, failed, how
+from experiments.gate.compare import WHICH, Finding, compare, failed_runs, how
 from experiments.gate.suite import ERRORS, Suite, read_suite, run_suite, suite_path
 from experiments.runs.paths import packaged, results
 from experiments.runs.version import code_version
@@ -24,7 +24,7 @@ _TEXTS = ("estimator", "checksum", "status")
 
 
 @dataclass(frozen=True)
-class Accepted:
+class AcceptedBaseline:
     """What was accepted.
 
     Attributes
@@ -115,7 +115,7 @@ def write_baseline(baseline: Baseline, path: Path) -> None:
     write_text(path, head + table)
 
 
-def renewed(
+def renew_baseline(
     old: Baseline | None,
     rows: pd.DataFrame,
     names: Sequence[str],
@@ -174,7 +174,7 @@ def check(
     InputError
         If the suite or a baseline cannot be used.
     """
-    suite = read_suite(suite_path(suite_name)).of(only).made(elsewhere=candidate is not None)
+    suite = read_suite(suite_path(suite_name)).select(only).made(elsewhere=candidate is not None)
     baselines = {
         key: read_baseline(path).rows
         for key, path in baseline_paths(suite_name).items()
@@ -191,7 +191,7 @@ def accept(
     release: bool = False,
     on_progress: Callable[[float], None] = lambda _: None,
     candidate: Path | None = None,
-) -> Accepted:
+) -> AcceptedBaseline:
     """Run a suite and make it the baseline, with the reason written into the file.
 
     With `only`, the other estimators keep their baselines. The release baseline stays as it is,
@@ -199,7 +199,7 @@ def accept(
     """
     require(reason.strip(), "accepting needs a reason, such as 'faster matching, 2 % worse'")
     whole = read_suite(suite_path(suite_name))
-    suite = whole.of(only).made(elsewhere=candidate is not None)
+    suite = whole.select(only).made(elsewhere=candidate is not None)
     names = [entry.name for entry in suite.estimators]
     paths = baseline_paths(suite_name)
     n_alike = sum(e.elsewhere == (candidate is not None) for e in whole.estimators)
@@ -211,7 +211,7 @@ def accept(
             "accept the whole suite",
         )
     rows = _rows(suite, 0, candidate, on_progress)
-    for _, first in rows[failed(rows)].head(1).iterrows():
+    for _, first in rows[failed_runs(rows)].head(1).iterrows():
         raise InputError(
             f"{first['estimator']} fails on recording {first['recording']} ({how(first)}); a "
             "baseline of failures guards nothing"
@@ -221,12 +221,12 @@ def accept(
     written, copied = [], []
     for key, path in baseline_paths(suite_name, own=True).items():
         if key == "accepted" or release or key not in old:
-            write_baseline(renewed(old.get(key), rows, names, reason, known), path)
+            write_baseline(renew_baseline(old.get(key), rows, names, reason, known), path)
             written.append(path)
         elif path != paths[key]:  # the package's comes along
             write_baseline(old[key], path)
             copied.append(path)
-    return Accepted(written, copied, findings)
+    return AcceptedBaseline(written, copied, findings)
 
 
 def _rows(

@@ -13,7 +13,7 @@ from experiments.evaluation.metrics import path_scores
 from experiments.gate.suite import ERRORS, Entry, Suite, fingerprint, read_suite, suite_path
 from experiments.runs.console import progress
 from experiments.runs.experiment import Experiment
-from experiments.runs.score import Scoring, scored_against
+from experiments.runs.score import Scoring, match_and_align
 from experiments.trajectories.read import SUFFIXES, read_trajectory
 from sim.errors import InputError, printable, require
 from sim.files import write_text
@@ -54,7 +54,7 @@ def write_recordings(
 
 def export_recordings(suite: str, only: Sequence[str], folder: Path) -> str:
     """Write the recordings of a suite's entries that are made elsewhere; say how many."""
-    chosen = read_suite(suite_path(suite)).of(only).made(elsewhere=True)
+    chosen = read_suite(suite_path(suite)).select(only).made(elsewhere=True)
     with progress("recordings", 1.0) as on_progress:
         return f"{folder}: {write_recordings(chosen, folder, on_progress)} recordings"
 
@@ -124,7 +124,7 @@ def _errors(
     if path is None:
         return nothing, f"missing: no trajectory {entry.recordings}_{seed}, repeat {repeat}"
     try:
-        scored = scored_against(recording, read_trajectory(path), Scoring())
+        scored = match_and_align(recording, read_trajectory(path), Scoring())
     except InputError as error:
         return nothing, printable(f"unreadable: {error}")
     if scored.longest_gap_s > LONGEST_GAP_S:
@@ -138,5 +138,5 @@ def _recordings(suite: Suite, group: str) -> Iterator[tuple[int, Experiment, Tea
     whole = Experiment.compose(suite.overrides[group])
     for i in range(suite.counts[group]):
         seed = suite.first_seed + i
-        experiment = whole.replaced(seed=seed, world_seed=seed)
+        experiment = whole.replace(seed=seed, world_seed=seed)
         yield seed, experiment, experiment.recordings()

@@ -249,7 +249,7 @@ def by_repeat(rows: pd.DataFrame, error: str) -> Array:
 
 def _same_recordings(estimator: str, name: str, then: pd.DataFrame, now: pd.DataFrame) -> None:
     remedy = "; accept a check with a reason to start a new baseline"
-    require(not then.empty, f"the {name} baseline does not know {estimator}{remedy}")
+    require(not then.empty, f"the {name} baseline has no {estimator}{remedy}")
     before, after = (
         rows.drop_duplicates("recording").set_index("recording") for rows in (then, now)
     )
@@ -268,7 +268,7 @@ def _same_recordings(estimator: str, name: str, then: pd.DataFrame, now: pd.Data
     )
 
 
-def failed(rows: pd.DataFrame) -> pd.Series:
+def failed_runs(rows: pd.DataFrame) -> pd.Series:
     """Which runs ended in an exception or in errors that are not finite."""
     finite = np.isfinite(rows[list(ERRORS)].to_numpy(np.float64)).all(axis=1)
     return (rows["status"] != "ok") | ~finite
@@ -281,8 +281,8 @@ def how(run: pd.Series) -> str:
 
 def _newly_failing(then: pd.DataFrame, now: pd.DataFrame) -> tuple[int, str] | None:
     """First recording where runs fail and none of the baseline's did, and how; None: no such."""
-    bad = now[failed(now)]
-    new = bad[~bad["recording"].isin(then.loc[failed(then), "recording"])]
+    bad = now[failed_runs(now)]
+    new = bad[~bad["recording"].isin(then.loc[failed_runs(then), "recording"])]
     for _, first in new.head(1).iterrows():
         line = f"{len(bad)} of {len(now)} runs fail; recording {first['recording']}: {how(first)}"
         return int(first["recording"]), line

@@ -67,7 +67,7 @@ def in_place_of(owner: Any, name: str) -> Callable[[Callable[..., Any]], Fault]:
     return decorate
 
 
-def lost(name: str) -> Fault:
+def lose_readings(name: str) -> Fault:
     """Each reading of a sensor is dropped with some probability."""
 
     @in_argument_of("step")
@@ -213,17 +213,17 @@ FAULTS: dict[str, dict[str, tuple[Fault, float]]] = {
     },
     "icp_odometry": {
         "derivative": (wrong_mount, 0.005),
-        "lost": (lost("laser"), 0.2),
+        "lost": (lose_readings("laser"), 0.2),
         "noise": (noisy_ranges, 0.005),
     },
     "ekf_icp": {
         "derivative": (wrong_between, 0.1),
-        "lost": (lost("laser"), 0.2),
+        "lost": (lose_readings("laser"), 0.2),
         "noise": (inflated_registration, 2.0),
     },
     "ekf_icp_paper": {
         "derivative": (wrong_observation, 0.1),
-        "lost": (lost("laser"), 0.05),
+        "lost": (lose_readings("laser"), 0.05),
         "noise": (inflated_registration, 1.0),
     },
     "ekf_slam": {
@@ -253,17 +253,17 @@ FAULTS: dict[str, dict[str, tuple[Fault, float]]] = {
     },
     "graph_slam": {
         "derivative": (wrong_mount, 0.005),
-        "lost": (lost("laser"), 0.2),
+        "lost": (lose_readings("laser"), 0.2),
         "noise": (noisy_ranges, 0.005),
     },
     "mcl": {
         "derivative": (wrong_wheels, 0.5),
-        "lost": (lost("laser"), 0.3),
+        "lost": (lose_readings("laser"), 0.3),
         "noise": (inflated_wheels, 1.0),
     },
     "topological_mcl": {
         "derivative": (wrong_travel, 0.2),
-        "lost": (lost("place"), 0.1),
+        "lost": (lose_readings("place"), 0.1),
         "noise": (noisy_descriptors, 0.3),
     },
 }

@@ -91,7 +91,7 @@ VARIANTS: dict[str, tuple[dict[str, str], bool]] = {
 }
 
 
-def reordered(estimator: Estimator, rng: np.random.Generator) -> AbstractContextManager[object]:
+def reorder_draws(estimator: Estimator, rng: np.random.Generator) -> AbstractContextManager[object]:
     """Draw one number before all others, so that each of them has another use."""
     sound = estimator.reset
 
@@ -249,7 +249,7 @@ def alarms(
     return sum(map(bool, checks)), named
 
 
-def smallest(pool: Pool, fault: tuple[str, str]) -> float:
+def smallest_detectable(pool: Pool, fault: tuple[str, str]) -> float:
     """Worsening, as a share, that 95 % of checks find of a fault that spreads as this one does.
 
     For each error: what the t test over the recordings finds and, of an estimator that draws at
@@ -293,7 +293,7 @@ def power_table(pool: Pool, n_checks: int, on_progress: Callable[[float], None])
                 "found": share.value,
                 "found_low": share.low,
                 "found_high": share.high,
-                "smallest": smallest(pool, fault),
+                "smallest": smallest_detectable(pool, fault),
             }
         )
         on_progress(done / len(pool.faulty))
@@ -303,7 +303,7 @@ def power_table(pool: Pool, n_checks: int, on_progress: Callable[[float], None])
 def run_variant(name: str, suite: Suite) -> pd.DataFrame:
     """Run a whole suite under one of VARIANTS, in this process's environment."""
     repeats = {entry.name: entry.repeats[1] for entry in suite.estimators}
-    planted = dict.fromkeys(repeats, reordered) if VARIANTS[name][1] else None
+    planted = dict.fromkeys(repeats, reorder_draws) if VARIANTS[name][1] else None
     return run_suite(suite, repeats, reseed=10 + list(VARIANTS).index(name), planted=planted)
 
 
@@ -412,7 +412,7 @@ def _write_measured(page: Path, text: str) -> None:
 _KINDS = {"derivative": (BLUE, "o"), "lost": (ORANGE, "s"), "noise": (GREEN, "^")}
 
 
-def detectable(power: pd.DataFrame, target: float) -> Figure:
+def draw_detectable(power: pd.DataFrame, target: float) -> Figure:
     """Worsening that 95 % of checks find, of each estimator and kind of fault, beside the goal."""
     page, axes = subplots(6.0, 3.4)
     names = list(dict.fromkeys(power["estimator"]))
@@ -459,7 +459,7 @@ def main() -> None:
     print(f"{hits} false alarms in {n_null} checks")
     print(power.to_string(index=False))
     write_frame(power, baseline_folder() / "power.csv")
-    save_figure(detectable(power, TARGET), SOURCE / "docs" / "figures" / "regression.png")
+    save_figure(draw_detectable(power, TARGET), SOURCE / "docs" / "figures" / "regression.png")
     page = SOURCE / "docs" / "regression.md"
     _write_measured(page, measured_text(pool, (hits, n_null), power, []))
     with progress("other conditions", 1.0) as on_progress:

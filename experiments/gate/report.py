@@ -14,7 +14,7 @@ import pandas as pd
 from experiments.gate.baseline import accept, baseline_folder, baseline_paths, check, is_main
 from experiments.gate.compare import Change, Finding
 from experiments.gate.suite import command_of, draw_run, read_suite, suite_path
-from experiments.report.export import escaped, to_markdown
+from experiments.report.export import escape_markdown, to_markdown
 from experiments.runs.columns import COLUMNS
 from experiments.runs.console import progress, show
 from experiments.runs.paths import results, short
@@ -141,7 +141,7 @@ def _where_to_look(suite: str, findings: Sequence[Finding]) -> str:
             if math.isfinite(then)
         ]
         seed = finding.worst[0][0]
-        (entry,) = whole.of([finding.estimator]).estimators
+        (entry,) = whole.select([finding.estimator]).estimators
         if entry.elsewhere:
             lines.append(f"look at its trajectory of {entry.recordings}_{seed}")
             continue
@@ -191,7 +191,7 @@ def as_text(
 def as_markdown(findings: Sequence[Finding], detectable: Mapping[str, float] | None = None) -> str:
     """Give the same as Markdown, for a pull request's summary."""
     lines = ["## estima check", "", last_line(findings), ""]
-    lines += [*(f"- {escaped(sentence(f))}" for f in _noteworthy(findings)), ""]
+    lines += [*(f"- {escape_markdown(sentence(f))}" for f in _noteworthy(findings)), ""]
     for table in _tables(findings, detectable):
         bold = table["verdict"].str.replace("^(worse|failed)", r"**\1**", regex=True)
         lines.append(to_markdown(table.assign(verdict=bold)))

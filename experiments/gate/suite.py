@@ -126,7 +126,7 @@ class Suite:
         counts = {group: round(share * n) for group, n in self.counts.items()}
         return dataclasses.replace(self, counts=counts)
 
-    def of(self, names: Sequence[str]) -> Suite:
+    def select(self, names: Sequence[str]) -> Suite:
         """Return the same suite with these estimators only; with all if none is named."""
         known = {entry.name: entry for entry in self.estimators}
         for name in names:
@@ -230,7 +230,7 @@ def run_suite(
         runs = [
             (
                 entry,
-                Experiment.compose(_overrides(suite, entry)).replaced(repeats=repeats[entry.name]),
+                Experiment.compose(_overrides(suite, entry)).replace(repeats=repeats[entry.name]),
                 (planted or {}).get(entry.name),
             )
             for entry in suite.estimators
@@ -250,14 +250,14 @@ def run_suite(
 
 def draw_run(suite: Suite, estimator: str, recording: int, path: Path) -> bool:
     """Draw the first run of an estimator over a recording of a suite; False if it fails."""
-    (entry,) = suite.of([estimator]).estimators
+    (entry,) = suite.select([estimator]).estimators
     estimates: list[tuple[Recording, Estimate]] = []
 
     def keep(read: Recording, _: int, online: Estimate, revised: Estimate | None) -> None:
         estimates.append((read, revised if entry.revised and revised is not None else online))
 
     (row, *_) = evaluate(
-        Experiment.compose(_overrides(suite, entry, recording)).replaced(repeats=1),
+        Experiment.compose(_overrides(suite, entry, recording)).replace(repeats=1),
         streams=partial(_stream, f"estimator/{estimator}", recording, 0),
         on_estimate=keep,
     )
@@ -268,7 +268,7 @@ def draw_run(suite: Suite, estimator: str, recording: int, path: Path) -> bool:
 
 def command_of(suite: Suite, estimator: str, recording: int) -> str:
     """Return the command that runs one estimator over one recording of a suite, and draws it."""
-    (entry,) = suite.of([estimator]).estimators
+    (entry,) = suite.select([estimator]).estimators
     return shlex.join(["estima", "run", *_overrides(suite, entry, recording)])
 
 
@@ -284,11 +284,11 @@ def _run_recording(
 ) -> list[dict[str, Any]]:
     """Rows of all runs over one recording."""
     rows = []
-    recording = runs[0][1].replaced(seed=seed, world_seed=seed).recordings()
+    recording = runs[0][1].replace(seed=seed, world_seed=seed).recordings()
     origin = {"checksum": recording.checksum[:12], "fingerprint": fingerprint(recording)}
     for entry, experiment, planted in runs:
         for row in evaluate(
-            experiment.replaced(seed=seed, world_seed=seed),
+            experiment.replace(seed=seed, world_seed=seed),
             lambda: recording,
             streams=partial(_stream, f"estimator/{entry.name}", seed, reseed),
             planted=planted and partial(_plant, planted, seed, reseed),

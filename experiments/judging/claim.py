@@ -132,7 +132,9 @@ def select(claims: Sequence[Claim], **wanted: Any) -> Claim:
     return found[0]
 
 
-def judged(interval: Interval, at_least: float = -math.inf, at_most: float = math.inf) -> Verdict:
+def judge_interval(
+    interval: Interval, at_least: float = -math.inf, at_most: float = math.inf
+) -> Verdict:
     """Judge an interval against [at_least, at_most]: inside, wholly outside, or spanning an end.
 
     An interval without bounds, for lack of data, leaves the claim undecided.
@@ -196,13 +198,13 @@ def beside(claim: Claim, is_beside: bool = True) -> Claim:
     return replace(claim, role=Role.BESIDE) if is_beside else claim
 
 
-def remarked(claim: Claim, remark: str, **facts: Any) -> Claim:
+def with_remark(claim: Claim, remark: str, **facts: Any) -> Claim:
     """Return a claim with a remark before its reason, and with facts."""
     reason = "; ".join(filter(None, [remark, claim.reason]))
     return replace(claim, reason=reason, facts={**claim.facts, **facts})
 
 
-def banded(
+def judge_bounds(
     about: Subject,
     statistic: str,
     found: Interval,
@@ -224,12 +226,12 @@ def banded(
     words = f"at least {at_least:g}" if at_least > -math.inf else f"at most {at_most:g}"
     if -math.inf < at_least and at_most < math.inf:
         words = f"within {at_least:.3g} and {at_most:g}"
-    verdict = judged(found, at_least, at_most)
+    verdict = judge_interval(found, at_least, at_most)
     more = more_to_settle(found, n, at_least, at_most)
     return Claim(about, statistic, found, criterion or words, verdict, more=more)
 
 
-def lower(about: Subject, statistic: str, first: ArrayLike, second: ArrayLike) -> Claim:
+def judge_lower(about: Subject, statistic: str, first: ArrayLike, second: ArrayLike) -> Claim:
     """Judge that paired values are lower in the first arm, by their ratio and Wilcoxon's p.
 
     Reproduced if the median ratio is below one and p < 0.01; not reproduced if the ratio's interval
@@ -260,7 +262,7 @@ def more_by_p(n: int, p: float, limit: float) -> int:
     return math.ceil(n * float((stats.norm.isf(limit) / max(stats.norm.isf(p), 0.1)) ** 2)) - n
 
 
-def equivalent(
+def judge_equivalent(
     about: Subject, statistic: str, first: ArrayLike, second: ArrayLike, margin: float
 ) -> Claim:
     """Judge that a paired ratio lies within 1 / (1 + m) and 1 + m, by two one-sided t tests.
@@ -269,4 +271,4 @@ def equivalent(
     """
     ratio = log_ratio_interval(first, second, level=0.90)
     low, high = 1.0 / (1.0 + margin), 1.0 + margin
-    return banded(about, f"{statistic} (90 % interval)", ratio, low, high, n=np.size(first))
+    return judge_bounds(about, f"{statistic} (90 % interval)", ratio, low, high, n=np.size(first))

@@ -16,7 +16,7 @@ from experiments.judging.claim import Claim, Role, Verdict
 from experiments.judging.results import Profile
 from experiments.judging.sentences import Conclusion
 from experiments.runs.row import read_rows, write_frame
-from experiments.runs.version import code_version, machine
+from experiments.runs.version import code_version, describe_machine
 from sim.errors import InputError, require
 from sim.files import require_file, write_whole
 
@@ -162,7 +162,7 @@ def note_provenance(results: Path, paper: str, profile: str, seconds: float) -> 
 
 def this_code() -> dict[str, Any]:
     """Version of the code, and the machine it runs on."""
-    return {"code_version": code_version(), **machine()}
+    return {"code_version": code_version(), **describe_machine()}
 
 
 def read_provenance(results: Path) -> dict[str, dict[str, Any]]:

@@ -78,7 +78,7 @@ def answer_of(
     return {name: found[name] for name in names if name in found}
 
 
-def grouped(runs: Iterable[T], key: Callable[[T], Hashable]) -> list[list[T]]:
+def group_by(runs: Iterable[T], key: Callable[[T], Hashable]) -> list[list[T]]:
     """Group runs by key, in the order in which the keys first appear."""
     groups: dict[Hashable, list[T]] = {}
     for run in runs:

@@ -36,7 +36,7 @@ TUNED_SHARE = 0.4  # of the Intel log, on which options were chosen; the rest ju
 CALIBRATED_S = 300.0  # from the start of a log of MRCLAM; the rest judges
 
 
-def missing() -> str:
+def why_missing() -> str:
     """Why a study of real logs cannot run; empty if it can."""
     return "" if DATA.is_dir() else f"the real logs are not in {DATA.parent.name}/{DATA.name}"
 
@@ -51,7 +51,7 @@ def intel(version: Literal["sparse", "logged", "calibrated"]) -> Recording:
     if version == "sparse":
         return intel_lab.read_intel(*INTEL_910)
     logged, _ = _thinned_intel()
-    return calibrated_by_scans(logged, tuned_until_s(logged)) if version == "calibrated" else logged
+    return calibrate_by_scans(logged, tuned_until_s(logged)) if version == "calibrated" else logged
 
 
 def intel_known_stamps(recording: Recording) -> Array:
@@ -77,7 +77,7 @@ def freiburg() -> Recording:
 def landmarks(robot: int, calibrated: bool, identifies: bool) -> Recording:
     """One robot of MRCLAM 6, with ranges and bearings to landmarks."""
     logged = mrclam.read_mrclam(MRCLAM_6, robot, identifies)
-    return calibration_by_truth(logged).applied(logged) if calibrated else logged
+    return calibrate_by_truth(logged).apply(logged) if calibrated else logged
 
 
 def wean_hall(number: int) -> Recording:
@@ -91,7 +91,7 @@ def known_start(recording: Recording, start: Array | None = None) -> Prior:
     return Prior(recording.robot, recording.sensors, mean, np.diag([1e-6] * 3))
 
 
-def tracked(estimator: Estimator, recording: Recording) -> tuple[Estimate, Estimate | None]:
+def track(estimator: Estimator, recording: Recording) -> tuple[Estimate, Estimate | None]:
     """Online and revised estimate from the origin."""
     prior, rng = known_start(recording, np.zeros(3)), np.random.default_rng(0)
     return run_over(recording, estimator, prior, rng, keep=("registration_status",))
@@ -102,13 +102,13 @@ def tuned_until_s(logged: Recording) -> float:
     return float(np.quantile(logged.log("laser").stamps, TUNED_SHARE))
 
 
-def calibrated_by_scans(recording: Recording, until_s: float) -> Recording:
+def calibrate_by_scans(recording: Recording, until_s: float) -> Recording:
     """The recording with wheels, track and laser calibrated by scan matching before `until_s`.
 
     The wheels of a log of poses are rebuilt with nominal sizes, so the calibration corrects those.
     """
     matcher = IcpOdometry(kr=3e-3, kl=3e-3, sigma_range_m=0.03, reference="previous")
-    estimate, _ = tracked(matcher, recording)
+    estimate, _ = track(matcher, recording)
     stamps, wheels = recording.log("laser").stamps, recording.wheels
     rows = np.searchsorted(estimate.stamps, stamps)
     poses, travel = estimate.means[rows], wheels.at(stamps)
@@ -130,7 +130,7 @@ def calibrated_by_scans(recording: Recording, until_s: float) -> Recording:
     )
 
 
-def calibration_by_truth(recording: Recording) -> Calibration:
+def calibrate_by_truth(recording: Recording) -> Calibration:
     """Calibration on the first `CALIBRATED_S`, with the noise that the log believes.
 
     What is believed of the noise was chosen on the robots that do not judge.

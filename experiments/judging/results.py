@@ -93,8 +93,8 @@ class Results:
         return self._path("arrays", f"{name}.npz").exists()
 
     @contextmanager
-    def as_found(self) -> Iterator[None]:
-        """Blame the files on disk for errors in what is made from them.
+    def blaming_files(self) -> Iterator[None]:
+        """Report errors in derived claims and figures as damaged files on disk.
 
         Raises
         ------
@@ -125,7 +125,7 @@ class Results:
 
 
 class _Arrays(Arrays):
-    """Arrays of a file, which is named if one is asked for that it lacks."""
+    """Arrays of a file; asking for a missing one raises an error that names the file."""
 
     def __init__(self, arrays: Mapping[str, NDArray[Any]], file: str, remedy: str) -> None:
         super().__init__(arrays)

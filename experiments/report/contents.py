@@ -17,12 +17,12 @@ from experiments.judging.claim import Role, Verdict, headline_verdict
 from experiments.judging.claims_file import read_claims, read_provenance, read_verdicts, this_code
 from experiments.judging.folders import code_folder, findings
 from experiments.judging.results import Profile
-from experiments.report.export import as_text, folded, numeric, plain
+from experiments.report.export import as_text, fold_intervals, numeric_columns, plain
 from experiments.report.leaderboard import by_world, on_lasers
 from experiments.runs.paths import CONF
 from experiments.runs.row import read_rows
 from experiments.sweeps.summary import COUNT_WORDS
-from experiments.viewing.panels import noted_panels
+from experiments.viewing.panels import read_panels
 from sim.errors import InputError, require
 from sim.files import require_file
 
@@ -88,7 +88,7 @@ def contents(results: Path, on_progress: Callable[[float], None]) -> dict[str, A
         "by_world": by_world(results / "tables" / "leaderboard_means.csv"),
         "first": next((pictures[name] for name in FIRST if name in pictures), None),
         "titles": {name: page["title"] for name, page in about.items()},
-        "holds_best": holding_best({name: studies[name]["tally"] for name in PAPERS}),
+        "holds_best": papers_holding_best({name: studies[name]["tally"] for name in PAPERS}),
         "on_lasers": on_lasers(results / "tables" / "peers_methods.csv"),
         "n_statistics": len(table),
         "n_judged": table["id"].nunique(),
@@ -110,7 +110,7 @@ def contents(results: Path, on_progress: Callable[[float], None]) -> dict[str, A
     }
 
 
-def holding_best(
+def papers_holding_best(
     tallies: Mapping[str, Sequence[tuple[Verdict, int]]],
 ) -> list[tuple[str, int, int]]:
     """The papers of the greatest share of reproduced claims, with their number and that of all."""
@@ -212,7 +212,7 @@ def picture(path: Path, about: Entry, claims: Mapping[str, Entry]) -> Entry:
     try:
         data = path.read_bytes()
         with Image.open(BytesIO(data), formats=["PNG"]) as image:
-            width, height, parts = *image.size, noted_panels(image)
+            width, height, parts = *image.size, read_panels(image)
     except UnidentifiedImageError as error:
         raise InputError(f"{path}: not a PNG; {_REMEDY}") from error
     except OSError as error:
@@ -262,7 +262,7 @@ def _beside_spread(mean: float, deviation: float) -> str:
 def table(path: Path) -> Entry:
     """Read a table: whole if it is small, else its first rows."""
     written = read_rows(path)
-    read = folded(written).rename(columns=COUNT_WORDS)
+    read = fold_intervals(written).rename(columns=COUNT_WORDS)
     frame = with_spread(read)
     joined = [c for c in frame if c not in read or frame[c].dtype != read[c].dtype]
     small = len(frame) <= SMALL_ROWS and frame.shape[1] <= SMALL_COLUMNS
@@ -278,6 +278,6 @@ def table(path: Path) -> Entry:
         "size": f"{len(frame)} rows, {frame.shape[1]} columns",
         "note": note,
         "head": list(shown.columns),
-        "numeric": [n or c in joined for n, c in zip(numeric(frame), frame, strict=True)],
+        "numeric": [n or c in joined for n, c in zip(numeric_columns(frame), frame, strict=True)],
         "cells": shown.to_numpy().tolist(),
     }

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import pandas as pd
 
-from experiments.runs.columns import alike, is_setting, title
+from experiments.runs.columns import format_alike, is_setting, title
 from experiments.runs.row import read_rows
 from experiments.sweeps.summary import MARKS, SUFFIXES
 from sim.errors import InputError, printable, require
@@ -77,11 +77,11 @@ def plain(value: Any, digits: int = 4) -> str:
     return f"{value:.{digits}g}" if isinstance(value, float) else str(value)
 
 
-def in_words(column: pd.Series[Any], digits: int = 4) -> list[str]:
+def setting_texts(column: pd.Series[Any], digits: int = 4) -> list[str]:
     """The values of a setting as `plain` texts, its numbers all in one way."""
     if column.dtype.kind != "f":
         return [plain(value) for value in column]
-    texts = alike(column, digits)
+    texts = format_alike(column, digits)
     return ["" if text == "nan" else text for text in texts]
 
 
@@ -103,7 +103,7 @@ class Mean(NamedTuple):
     differs: bool
 
 
-def folded(frame: pd.DataFrame) -> pd.DataFrame:
+def fold_intervals(frame: pd.DataFrame) -> pd.DataFrame:
     """Put a mean, its bounds and its marks, columns of `sweeps.summary`, into one cell."""
     cells = {}
     for name in frame:
@@ -140,7 +140,7 @@ def written(frame: pd.DataFrame, form: Form, digits: int) -> pd.DataFrame:
     long = not any(isinstance(cell, Mean) for cell in frame.head(1).to_numpy().ravel())
     heads = [" ".join(title(str(name), short=not long).split()) for name in frame]
     numbers = [c for c in frame if is_setting(str(c)) and frame[c].dtype.kind == "f"]
-    alike_in = {name: in_words(frame[name], digits) for name in numbers}
+    alike_in = {name: setting_texts(frame[name], digits) for name in numbers}
     return (
         frame.assign(**alike_in)
         .set_axis([form.escape(printable(h)) for h in heads], axis=1)
@@ -154,7 +154,7 @@ def as_text(frame: pd.DataFrame, digits: int = 4) -> pd.DataFrame:
     return written(frame, Form(str, "{}", "*"), digits)
 
 
-def numeric(frame: pd.DataFrame) -> list[bool]:
+def numeric_columns(frame: pd.DataFrame) -> list[bool]:
     """Whether each column holds numbers."""
     return [
         column.dtype.kind in "iuf" or column.map(lambda cell: isinstance(cell, Mean)).any()
@@ -162,18 +162,18 @@ def numeric(frame: pd.DataFrame) -> list[bool]:
     ]
 
 
-def escaped(text: str) -> str:
+def escape_markdown(text: str) -> str:
     """Text in which Markdown and HTML find nothing of theirs."""
     return _MARKDOWN.sub(r"\\\g<0>", text)
 
 
 def to_markdown(frame: pd.DataFrame, digits: int = 4) -> str:
     """Pipe table; columns of numbers are aligned to the right."""
-    table: str = written(frame, Form(escaped, "**{}**", r"\*"), digits).to_markdown(
+    table: str = written(frame, Form(escape_markdown, "**{}**", r"\*"), digits).to_markdown(
         index=False,
         tablefmt="pipe",
         disable_numparse=True,
-        colalign=["right" if number else "left" for number in numeric(frame)],
+        colalign=["right" if number else "left" for number in numeric_columns(frame)],
     )
     return table + "\n"
 
@@ -186,7 +186,7 @@ def to_latex(frame: pd.DataFrame, digits: int = 4, width_pt: float = TEXT_PT) ->
     """
     best, differs = r"\textbf{{\boldmath {}}}", "$^{*}$"
     cells = written(frame, Form(latex, best, differs), digits)
-    columns = "".join("r" if number else "l" for number in numeric(frame))
+    columns = "".join("r" if number else "l" for number in numeric_columns(frame))
     if sum(_widths(cells, _LETTER_PT, _GAP_PT)) <= width_pt:
         return _tabular(cells, columns)
     small = Form(lambda text: _in_lines(text, _TEXT_LETTERS), best, differs, "\n[{}, {}]")
@@ -289,7 +289,7 @@ def export(paths: Sequence[Path], form: str, out: Path | None, digits: int) -> N
             first == i, f"{paths[first]} and {path} would both become {out}/{path.stem}{suffix}"
         )
     for path in paths:
-        text = as_form(folded(read_table(path)), digits)
+        text = as_form(fold_intervals(read_table(path)), digits)
         if out is not None:
             write_text(out / f"{path.stem}{suffix}", text)
             continue

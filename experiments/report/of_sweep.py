@@ -1,4 +1,4 @@
-"""What is made of a sweep's rows: a table, a chart or a page, as a text or a file."""
+"""Output from a sweep's rows: a table, a chart or a page, as text or a file."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from experiments.report.plot import Size, sweep_figure
 from experiments.report.sweep_page import extremes, picture_path, write_sweep_page
 from experiments.report.table import as_lines, notes, statuses, write_table
 from experiments.runs import paths
-from experiments.runs.console import counted, progress, show
+from experiments.runs.console import pluralize, progress, show
 from experiments.runs.row import Outcome, write_frame
-from experiments.sweeps.again import draw_again, short_key
-from experiments.sweeps.collect import collect, folder_of, suggested
+from experiments.sweeps.again import draw_recorded_run, short_key
+from experiments.sweeps.collect import collect, folder_of, suggest_axes
 from experiments.sweeps.summary import ERROR, summary
 from experiments.viewing.play import Showing
 from experiments.viewing.style import save_figure
@@ -53,7 +53,7 @@ def after_sweep(folder: Path, n_runs: int) -> None:
 def write_rows(rows: pd.DataFrame, out: Path) -> str:
     """Write every row, with all its columns; say how many."""
     write_frame(rows, out)
-    return f"{out}: {counted(len(rows), 'row')}, {len(rows.columns)} columns"
+    return f"{out}: {pluralize(len(rows), 'row')}, {len(rows.columns)} columns"
 
 
 def table_of(
@@ -69,7 +69,7 @@ def table_of(
     note = notes(found, against)
     if out is not None:
         write_table(found, note, out, Path(name).name, size)
-        return f"{out}: {counted(len(found), 'row')}"
+        return f"{out}: {pluralize(len(found), 'row')}"
     lines = as_lines(found, note)
     if (rows["status"] != Outcome.OK).any():
         lines += "\n\n" + "\n".join(f"{count} {words}" for words, count in statuses(rows))
@@ -102,7 +102,7 @@ def plot_of(rows: pd.DataFrame, name: str, panels: Panels, out: Path) -> str:
     chosen = ""
     if panels.x is None:
         taken = [each for each in (*panels.by, panels.row, panels.col) if each]
-        x, *others = suggested(rows, taken)
+        x, *others = suggest_axes(rows, taken)
         panels = replace(panels, x=x)
         if not taken:
             panels = replace(panels, by=others[:1], col=next(iter(others[1:]), None))
@@ -149,6 +149,10 @@ def _draw_extremes(
             continue
         out.parent.mkdir(parents=True, exist_ok=True)
         try:
-            show(draw_again(row, Showing(out), f"{called}/{short_key(row)}", config_dir, folder))
+            show(
+                draw_recorded_run(
+                    row, Showing(out), f"{called}/{short_key(row)}", config_dir, folder
+                )
+            )
         except InputError as error:
             print(f"{out.name} is not drawn: {error}", file=sys.stderr)

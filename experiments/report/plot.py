@@ -15,10 +15,17 @@ import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from experiments.report.export import in_words
-from experiments.runs.columns import ANSWER, COLUMNS, PATH, REPEAT, alike, title
-from experiments.sweeps.averages import averages, pooled, rule, unit_of
-from experiments.sweeps.collect import DRAWN, dozen, measured, no_column, telling, with_answers
+from experiments.report.export import setting_texts
+from experiments.runs.columns import ANSWER, COLUMNS, PATH, REPEAT, format_alike, title
+from experiments.sweeps.averages import averages, pool_repeats, rule, unit_of
+from experiments.sweeps.collect import (
+    DRAWN,
+    distinguishing_settings,
+    first_names,
+    no_column,
+    result_columns,
+    with_answers,
+)
 from experiments.viewing.plotting import literal, plain_log
 from experiments.viewing.style import SERIES, figure
 from sim.errors import InputError, require
@@ -103,10 +110,10 @@ def sweep_figure(
     words_in = [c for c in groups if table[c].map(lambda value: isinstance(value, str)).all()]
     table = table.assign(**{c: table[c].map(literal) for c in words_in})
     unit = unit_of(table, groups)
-    over = [c for c in telling(table) if c not in (*groups, *DRAWN)]
+    over = [c for c in distinguishing_settings(table) if c not in (*groups, *DRAWN)]
     means = averages(table, groups, unit, y, over).reset_index()
     unbounded = means.loc[means["low"].isna(), groups]
-    dots = pooled(table, [*groups, unit], y, over).reset_index().merge(unbounded, on=groups)
+    dots = pool_repeats(table, [*groups, unit], y, over).reset_index().merge(unbounded, on=groups)
     texts = {name: _texts(means[name]) for name in groups}
     lines = _labels(means, by, texts)
     require(
@@ -177,7 +184,7 @@ def _check(table: pd.DataFrame, y: str, groups: Sequence[str]) -> None:
             raise no_column(table, column, metric=column == y)
     require(
         table[y].dtype.kind in "fi",
-        f"column {y} holds no numbers; there are {dozen(measured(table)) or 'none'}",
+        f"column {y} holds no numbers; there are {first_names(result_columns(table)) or 'none'}",
     )
 
 
@@ -196,7 +203,7 @@ def _complete(table: pd.DataFrame, y: str, groups: Sequence[str]) -> tuple[pd.Da
 def _check_points(table: pd.DataFrame, groups: Sequence[str]) -> None:
     """Check that no point pools what differs in kind."""
     points = table.groupby(list(groups))
-    for column in [c for c in telling(table) if c not in DRAWN]:
+    for column in [c for c in distinguishing_settings(table) if c not in DRAWN]:
         if points[column].nunique().max() > 1:
             there = ", ".join(map(str, sorted(table[column].dropna().unique())[:8]))
             raise InputError(
@@ -239,7 +246,7 @@ class _Across:
 def _texts(column: pd.Series[Any]) -> dict[Any, str]:
     """What the values of a setting are called, in their order."""
     values = column.drop_duplicates().sort_values()
-    return dict(zip(values, in_words(values, 6), strict=True))
+    return dict(zip(values, setting_texts(values, 6), strict=True))
 
 
 def _named(name: str, value: Any, texts: Mapping[Any, str]) -> str:
@@ -305,7 +312,7 @@ def _scale(
         ax.set_yscale("log")
         if high < _DECADES * low:
             plain_log(ax.yaxis)
-            ax.yaxis.set_major_formatter(lambda value, _: alike([value, low])[0])
+            ax.yaxis.set_major_formatter(lambda value, _: format_alike([value, low])[0])
 
 
 def _name_lines(page: Figure, axes: Any, heading: str, size: Size, *, direct: bool) -> None:

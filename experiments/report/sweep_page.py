@@ -16,7 +16,7 @@ import pandas as pd
 from markupsafe import Markup
 from scipy import stats
 
-from experiments.report.export import in_words, numeric, plain, written
+from experiments.report.export import numeric_columns, plain, setting_texts, written
 from experiments.report.page import TEMPLATES, render
 from experiments.report.plot import by_factors
 from experiments.report.table import DIGITS, HTML, WORDS, notes, shown, statuses
@@ -29,10 +29,10 @@ from experiments.sweeps.collect import (
     DRAWN,
     FEW,
     commands,
-    measured,
-    suggested,
-    telling,
-    unfinished,
+    distinguishing_settings,
+    result_columns,
+    suggest_axes,
+    unfinished_sweeps,
     with_answers,
 )
 from experiments.sweeps.summary import ERROR, summary
@@ -63,7 +63,7 @@ def write_sweep_page(
     folder
         Where the rows lie, for the command that made them.
     config_dir
-        Folder of options of one's own, for the commands that draw runs; by default the sweep's.
+        Folder with your own options, for the commands that draw runs; by default the sweep's.
 
     Raises
     ------
@@ -75,11 +75,11 @@ def write_sweep_page(
         f"{name}: {len(table)} runs; a page holds {MOST_RUNS}: keep some by a condition",
     )
     every = with_answers(table, [column for column in COLUMNS if column.startswith(ANSWER)])
-    metrics = [c for c in COLUMNS if c in measured(every) and every[c].notna().any()]
+    metrics = [c for c in COLUMNS if c in result_columns(every) and every[c].notna().any()]
     require(
         metrics, f"{name}: no run has a result to show; `estima table {name}` says how they ended"
     )
-    telling_apart = telling(table)
+    telling_apart = distinguishing_settings(table)
     named = [c for c in telling_apart if c != "choice.estimator"]
     pictures = {
         path.stem: quote(path.relative_to(out.parent).as_posix())
@@ -98,7 +98,7 @@ def write_sweep_page(
         "sweep.html",
         name=name,
         n_runs=len(table),
-        unfinished=unfinished(folder),
+        unfinished=unfinished_sweeps(folder),
         controls=_controls(every, drawn_by, settings, metrics),
         filters=[
             (i, each["title"], each["words"])
@@ -127,7 +127,7 @@ def write_sweep_page(
         statuses=statuses(table),
         note=notes(found, None),
         head=[Markup(cell) for cell in means],
-        numeric=numeric(shown(found)),
+        numeric=numeric_columns(shown(found)),
         rows=[[Markup(cell) for cell in row] for row in means.to_numpy()],
         runs=_shown(runs, named, pictures),
         run_settings=[titled(c) for c in named],
@@ -145,7 +145,7 @@ def _controls(
     table: pd.DataFrame, names: Sequence[str], settings: Sequence[Entry], metrics: Sequence[str]
 ) -> list[tuple[str, list[tuple[int, str]], int]]:
     """What the reader chooses: its name, the options by their places, and the first choice."""
-    x, colour, panels, *_ = [*suggested(table), "", ""]
+    x, colour, panels, *_ = [*suggest_axes(table), "", ""]
     y = next((m for m in (ERROR, "ate_rmse_m") if m in metrics), metrics[0])
     every = [(i, each["title"]) for i, each in enumerate(settings)]
     few = [(-1, "none"), *(each for each in every if len(settings[each[0]]["words"]) <= FEW)]
@@ -182,7 +182,7 @@ def _setting(column: pd.Series[Any], name: str) -> dict[str, Any]:
         column = column.map(lambda value: printable(str(value)), na_action="ignore")
     codes, values = pd.factorize(column, sort=True)
     is_drawn = name in (*DRAWN, REPEAT)  # such numbers have no order
-    words = in_words(pd.Series(values), 6)
+    words = setting_texts(pd.Series(values), 6)
     axis: dict[str, Any] = {
         "type": "nominal",
         "sort": words,
@@ -281,7 +281,7 @@ def _shown(
     runs: pd.DataFrame, settings: Sequence[str], pictures: Mapping[str, str]
 ) -> list[dict[str, Any]]:
     """What the table of the best and worst runs says of each."""
-    values = {name: in_words(runs[name]) for name in settings}
+    values = {name: setting_texts(runs[name]) for name in settings}
     return [
         {
             "estimator": row["choice.estimator"],

@@ -10,10 +10,10 @@ from markupsafe import Markup, escape
 from experiments.report.export import (
     TEXT_PT,
     Form,
-    escaped,
-    folded,
+    escape_markdown,
+    fold_intervals,
     latex,
-    numeric,
+    numeric_columns,
     to_latex,
     to_markdown,
     written,
@@ -80,7 +80,7 @@ def shown(found: pd.DataFrame) -> pd.DataFrame:
     """A summary with a cell a mean, and without columns that say nothing."""
     silent = [name for name in COUNTS if not found[name].any()]
     silent += [PATH] if (found[PATH] == "online").all() else []
-    return folded(found.drop(columns=silent)).rename(columns=COUNT_WORDS)
+    return fold_intervals(found.drop(columns=silent)).rename(columns=COUNT_WORDS)
 
 
 def as_lines(found: pd.DataFrame, note: str) -> str:
@@ -94,7 +94,7 @@ def write_table(
 ) -> None:
     """Write a summary in the format of the path's ending, with its note where the format has text.
 
-    LaTeX is a `tabular` and a line of small print, for a float of one's own; it needs `booktabs`.
+    LaTeX is a `tabular` and a line of small print, for your own float; it needs `booktabs`.
     One wider than its `size` (of `WIDTHS_PT`, `text` by default) becomes several.
     """
     if path.suffix in (".csv", ".parquet"):
@@ -109,7 +109,7 @@ def write_table(
         engine = "" if table.isascii() else ", and LuaLaTeX if pdfLaTeX lacks a letter"
         text = f"% needs \\usepackage{{booktabs}}{engine}\n{table}{small}"
     elif path.suffix == ".md":
-        text = f"{escaped(note)}\n\n{to_markdown(frame, DIGITS)}"
+        text = f"{escape_markdown(note)}\n\n{to_markdown(frame, DIGITS)}"
     else:
         cells = written(frame, HTML, DIGITS)
         text = render(
@@ -117,7 +117,7 @@ def write_table(
             name=name,
             note=note,
             head=[Markup(head) for head in cells],
-            numeric=numeric(frame),
+            numeric=numeric_columns(frame),
             rows=[[Markup(cell) for cell in row] for row in cells.to_numpy()],
         )
     write_text(path, text)

@@ -1,4 +1,4 @@
-"""A cache of recordings, addressed by what decides their bits: a sweep simulates each of them once.
+"""A cache of recordings, addressed by a digest of their inputs: a sweep simulates each once.
 
 It holds at most $ESTIMA_CACHE_GIB (8 unless set); the least recently used go first.
 """
@@ -13,7 +13,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from experiments.runs import paths
-from experiments.runs.processes import locked
+from experiments.runs.processes import hold_lock
 from sim.errors import InputError, require
 from sim.files import require_file
 from sim.recording import Recording, load, save
@@ -29,7 +29,7 @@ def folder() -> Path:
     return paths.results() / "cache" / "recordings"
 
 
-def cached(key: str, make: Callable[[], Recording]) -> Recording:
+def fetch_or_make(key: str, make: Callable[[], Recording]) -> Recording:
     """Recording of the key, from the cache, or made now and cached.
 
     Safe with several processes: the second waits for the first and reads its file. A file that
@@ -37,7 +37,7 @@ def cached(key: str, make: Callable[[], Recording]) -> Recording:
     """
     path = folder() / f"{key}.npz"
     limit = limit_bytes()
-    with locked(path.with_suffix(".lock")):
+    with hold_lock(path.with_suffix(".lock")):
         if path.exists():
             require_file(path)
             try:
@@ -111,7 +111,7 @@ def trim(most_bytes: float) -> int:
 def _dropped(path: Path) -> bool:
     """Drop a recording, unless a process is reading or writing it; return whether it is gone."""
     try:
-        with locked(path.with_suffix(".lock"), wait=False):
+        with hold_lock(path.with_suffix(".lock"), wait=False):
             path.unlink(missing_ok=True)
     except BlockingIOError:
         return False

@@ -1,4 +1,4 @@
-"""What is believed of a real robot: the YAML file of `estima calibrate LOG`, and its use."""
+"""A real robot's calibration: the YAML file of `estima calibrate LOG`, and its use."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -85,8 +85,8 @@ class Calibration:
     slip: Slip
     sensors: Mapping[str, SensorBelief] = field(default_factory=dict)
 
-    def applied(self, recording: Recording) -> Recording:
-        """Return the recording with what is believed in place of what its log says.
+    def apply(self, recording: Recording) -> Recording:
+        """Return the recording with the log's values replaced by the calibrated ones.
 
         Raises
         ------

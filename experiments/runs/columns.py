@@ -243,7 +243,7 @@ def _parted(name: str) -> tuple[list[str], str]:
     return [_WORDS.get(word, word) for word in own], unit
 
 
-def alike(values: Iterable[float], digits: int = 4) -> list[str]:
+def format_alike(values: Iterable[float], digits: int = 4) -> list[str]:
     """Numbers of one setting as texts: all with powers of ten if one of them needs it.
 
     Examples

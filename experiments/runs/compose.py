@@ -26,11 +26,11 @@ from experiments.runs.schema import (
     KEYS,
     Config,
     check_shape,
+    describe_unknown,
+    describe_unknown_key,
     fill,
     leaves,
     select,
-    unknown,
-    unknown_key,
 )
 from sim.errors import InputError, require
 from sim.files import write_text
@@ -64,7 +64,7 @@ class Composed:
     choices: Mapping[str, str]
     params: Mapping[str, str]
 
-    def resolved(self) -> tuple[Config, dict[str, str]]:
+    def resolve(self) -> tuple[Config, dict[str, str]]:
         """Plain values, and the choice of each group.
 
         Raises
@@ -106,11 +106,11 @@ class Composer:
     def __init__(self, extra: Sequence[str] = ()) -> None:
         check_overrides(extra)
         self.extra = list(extra)
-        self.parse = functools.lru_cache(maxsize=4096)(parsed)
+        self.parse = functools.lru_cache(maxsize=4096)(parse_override)
         self._is_group: dict[str, bool] = {}
         self._bases: dict[tuple[str, ...], Composed] = {}
 
-    def composed(self, overrides: Sequence[str]) -> Composed:
+    def compose(self, overrides: Sequence[str]) -> Composed:
         """Compose a configuration.
 
         Raises
@@ -164,7 +164,7 @@ class Composer:
 
 
 @contextmanager
-def composing(extra: Sequence[str] = ()) -> Iterator[Composer]:
+def open_composer(extra: Sequence[str] = ()) -> Iterator[Composer]:
     """Yield a composer of the project's configuration."""
     with initialize_config_dir(str(paths.CONF), version_base="1.3"):
         yield Composer(extra)
@@ -214,20 +214,20 @@ class CommandLine:
         return cls(given.overrides, given.config_dir, given.cfg is not None, given.resolve)
 
 
-def option_called(group: str, name: str, config_dir: str | Path | None = None) -> str:
+def find_option(group: str, name: str, config_dir: str | Path | None = None) -> str:
     """The option of a group that has this name, such as `peers/kiss_icp`; else the name itself."""
     folders = [paths.CONF, *([Path(config_dir)] if config_dir else [])]
     every = (option for folder in folders for option in paths.option_names(group, folder))
     return next((option for option in every if option.rpartition("/")[2] == name), name)
 
 
-def composed_options(overrides: Sequence[str]) -> DictConfig:
+def compose_options(overrides: Sequence[str]) -> DictConfig:
     """A configuration, not resolved, of overrides that may name a study's file."""
-    with composing() as composer:
-        return composer.composed(with_study_file(overrides)).cfg
+    with open_composer() as composer:
+        return composer.compose(name_study_files(overrides)).cfg
 
 
-def parsed(text: str) -> Override:
+def parse_override(text: str) -> Override:
     """One override of Hydra's grammar."""
     (override,) = OverridesParser.create().parse_overrides([text])
     return override
@@ -247,7 +247,7 @@ def set_value(cfg: DictConfig, key: str, value: Any) -> None:
     if isinstance(node, ListConfig):
         names = [str(place) for place in range(len(node))]
     if leaf not in names:
-        raise InputError(unknown_key(key, cfg))
+        raise InputError(describe_unknown_key(key, cfg))
     OmegaConf.update(cfg, key, value, merge=True)
 
 
@@ -294,7 +294,7 @@ def searched(config_dir: str | Path | None) -> list[str]:
     return [f"hydra.searchpath=[{paths.quoted(f'file://{folder}')}]"]
 
 
-def with_study_file(overrides: Sequence[str]) -> list[str]:
+def name_study_files(overrides: Sequence[str]) -> list[str]:
     """Overrides in which `study=FILE.yaml` is a name, and the folder in which Hydra looks for it.
 
     Hydra knows an option by its name in a folder of its group, so a study that lies elsewhere is
@@ -357,7 +357,7 @@ def _check_added(overrides: Sequence[Override], groups: Collection[str]) -> None
     for override in overrides:
         if override.is_add() or override.is_force_add():
             key = override.key_or_group.partition(".")[0]
-            require(key in KEYS or override.key_or_group in groups, unknown(key, KEYS))
+            require(key in KEYS or override.key_or_group in groups, describe_unknown(key, KEYS))
 
 
 def check_hydra(overrides: Sequence[str]) -> None:

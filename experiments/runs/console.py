@@ -107,7 +107,7 @@ def _time(s: float) -> str:
     return f"{s / 60:.0f} min" if s > 90 else f"{s:.0f} s"
 
 
-def end(error: BaseException) -> NoReturn:
+def exit_with(error: BaseException) -> NoReturn:
     """End the program with one line for what the user can fix: code 2 for input, 1 for failures.
 
     So it ends after an interrupt, with that one's message and code 130.
@@ -146,7 +146,7 @@ def _in_defaults(error: BaseException) -> bool:
 
 
 def _refusal(error: BaseException) -> str | None:
-    """Say what Hydra could not find, and what there is; None if the error is another."""
+    """Describe what Hydra could not find, with the alternatives; None for other errors."""
     missing, options = (getattr(error, name, None) for name in ("missing_cfg_file", "options"))
     if not (missing and options):
         return None
@@ -162,7 +162,7 @@ def _configuration_errors() -> tuple[type[Exception], ...]:
     return tuple(getattr(sys.modules[m], name) for m, _, name in places if m in sys.modules)
 
 
-def counted(n: int, what: str) -> str:
+def pluralize(n: int, what: str) -> str:
     """A number of things, such as 1 run or 2 runs."""
     return f"{n} {what}" if n == 1 else f"{n} {what}s"
 

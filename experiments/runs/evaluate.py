@@ -1,14 +1,19 @@
 """The one runner: an experiment's rows."""
 
+import dataclasses
 import functools
+import math
 import os
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from contextlib import AbstractContextManager, nullcontext
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from threadpoolctl import ThreadpoolController
 
-from estimators.base import Answer, Estimate, Estimator, Prior, run_to_the_end
+from estimators.base import Answer, Estimate, Estimator, Prior, run_and_finish
+from estimators.team import run_team
 from experiments.evaluation.map_quality import landmark_errors
 from experiments.evaluation.metrics import (
     LONGEST_GAP_S,
@@ -16,16 +21,19 @@ from experiments.evaluation.metrics import (
     longest_pause_s,
     score,
 )
-from experiments.runs.columns import OF_THE_RUN, REVISED
+from experiments.runs.columns import OF_THE_RUN, REVISED, Average, average_of
 from experiments.runs.experiment import Experiment
+from experiments.runs.objects import Objects
 from experiments.runs.row import GAP, Outcome, Row, Status
 from experiments.runs.seeds import stream
-from experiments.runs.team import answers_of_team, scores_of_team, status_of_team
 from sim.arrays import Array
-from sim.errors import InputError, require
+from sim.errors import InputError, require, required
 from sim.recording import Recording
+from sim.sensors import RobotCamera
 from sim.team import Team
 
+_ADDED = ("stamps_scored", "stamps_left_out", "step_time_us")  # over the robots
+_STREAMS = 100  # of a run's filters
 REMARKED_PAUSE_S = 1.0  # without a pose
 
 Streams = Callable[[int], np.random.Generator]
@@ -93,7 +101,7 @@ def evaluate(
                 answers = answers_of(estimator, repeat, on_step)
             paired = [(r, *answer) for r, answer in zip(read.robots, answers, strict=True)]
             statuses = [status_of(*each) for each in paired]
-            every = [scored(*each, **experiment.config["scoring"]) for each in paired]
+            every = [score_run(*each, **experiment.config["scoring"]) for each in paired]
             status, scores = statuses[0], every[0]
             if experiment.team is not None:
                 status, scores = status_of_team(statuses), scores_of_team(read, every)
@@ -129,7 +137,7 @@ def runner(
         if experiment.team is None:
             keep = (*SCORED_EXTRAS, *experiment.config["keep"])
             return [run_over(read.only, estimator, priors[0], own(repeat), keep, on_step)]
-        with limited_blas():
+        with limit_blas():
             return answers_of_team(experiment, read, priors, repeat, own, on_step)
 
     return answers
@@ -158,11 +166,11 @@ def run_over(
     BLAS uses one thread, or as many as ESTIMA_BLAS_THREADS says: its threads spin while they wait,
     and the matrices of filters are small.
     """
-    with limited_blas():
-        return run_to_the_end(estimator, recording, prior, rng, keep, on_step)
+    with limit_blas():
+        return run_and_finish(estimator, recording, prior, rng, keep, on_step)
 
 
-def limited_blas() -> AbstractContextManager[object]:
+def limit_blas() -> AbstractContextManager[object]:
     """Context in which BLAS uses one thread, or as many as ESTIMA_BLAS_THREADS says.
 
     The variables of BLAS itself do not count: the workers of a sweep find them set by joblib.
@@ -183,7 +191,7 @@ def _blas() -> ThreadpoolController:
     return ThreadpoolController()
 
 
-def scored(
+def score_run(
     recording: Recording,
     online: Estimate,
     revised: Estimate | None,
@@ -236,3 +244,112 @@ def status_of_pauses(recording: Recording, stamps: Array) -> Status:
     if pause_s <= max(REMARKED_PAUSE_S, own_s):
         return Status()
     return Status(Outcome.REMARK, GAP, f"no pose for {pause_s:.3g} s of the recording")
+
+
+# The robots of a team
+
+
+def answers_of_team(
+    experiment: Objects,
+    team: Team,
+    priors: Sequence[Prior],
+    repeat: int,
+    streams: Callable[[int], np.random.Generator],
+    on_step: Callable[[int], None] | None = None,
+) -> list[Answer]:
+    """Online and revised estimate of each robot.
+
+    A robot whose start is not known has no estimate until it is placed. The estimates share the
+    processor time of the run.
+
+    Parameters
+    ----------
+    repeat
+        Which of the runs over the same team.
+    streams
+        Generators of the filters by number.
+    on_step
+        Called with the number of Frames done.
+    """
+    settings = required(experiment.team, "team must hold keys; choose study=teams")
+    range_m = settings.communication.range_m
+    answers = run_team(
+        experiment.team_estimator,
+        team,
+        priors,
+        lambda robot: streams(_STREAMS * repeat + robot),
+        settings.communication,
+        None if range_m is None else in_range(team, range_m),
+        on_step,
+    )
+    if settings.starts == "known":
+        return answers
+    others = [(_placed(online), revised and _placed(revised)) for online, revised in answers[1:]]
+    return [answers[0], *others]
+
+
+def status_of_team(statuses: Sequence[Status]) -> Status:
+    """The worst of the robots' statuses, which says whose it is."""
+    rank = [list(Outcome).index(status.outcome) for status in statuses]
+    number = int(np.argmax(rank))
+    worst = statuses[number]
+    detail = f"robot {number}: {worst.detail}" if worst.detail else ""
+    return dataclasses.replace(worst, detail=detail)
+
+
+def scores_of_team(team: Team, scores: Sequence[Row]) -> Row:
+    """The one row of a team's run, of the scores of its robots.
+
+    Errors are pooled by their squares over all stamps that count. Counts and times of a step add
+    up; all else is averaged over the stamps. `worst_robot_rmse_m` comes from the best answers.
+    """
+    row: Row = {}
+    for name in dict.fromkeys(name for own in scores for name in own):
+        given = [own for own in scores if name in own]
+        values = np.array([own[name] for own in given], np.float64)
+        weights = np.array([own.get("stamps_scored", 1.0) for own in given], np.float64)
+        if name in _ADDED or name.removeprefix(REVISED) in _ADDED:
+            row[name] = float(values.sum())
+        elif average_of(name) is Average.ERROR:
+            row[name] = math.sqrt(np.average(values**2, weights=weights))
+        else:
+            row[name] = float(np.average(values, weights=weights))
+    error = "ate_rmse_m"
+    worst = [own.get(f"{REVISED}{error}", own.get(error)) for own in scores]
+    known = [float(value) for value in worst if isinstance(value, float)]
+    if known:
+        row["worst_robot_rmse_m"] = float(np.max(known))
+    row["n_sightings"] = sum(
+        len(log["points_in_camera"])
+        for robot in team.robots
+        for name, log in robot.logs.items()
+        if isinstance(robot.sensors[name], RobotCamera)
+    )
+    return row
+
+
+def in_range(team: Team, range_m: float) -> NDArray[np.bool_]:
+    """Which robots are within a distance of each other, (T, R, R) at each instant, by the truth."""
+    stamps = np.unique(np.concatenate([recording.frame_stamps for recording in team.robots]))
+    at: Array = np.stack([_where(recording, stamps) for recording in team.robots], axis=1)
+    apart = at[:, :, None] - at[:, None]
+    return np.asarray(np.hypot(apart[..., 0], apart[..., 1]) <= range_m)
+
+
+def _where(recording: Any, stamps: Array) -> Array:
+    """True positions (T, 2); before and after its recording a robot stands where it was."""
+    truth = recording.known_truth.stamps
+    return np.asarray(recording.truth_at(np.clip(stamps, truth[0], truth[-1]))[:, :2])
+
+
+def _placed(estimate: Estimate) -> Estimate:
+    """The estimate from its first pose on; as it is, if there is none."""
+    known = np.isfinite(estimate.means).all(axis=1)
+    kept = slice(int(np.argmax(known)), None)
+    return dataclasses.replace(
+        estimate,
+        stamps=estimate.stamps[kept],
+        means=estimate.means[kept],
+        covariances=estimate.covariances[kept],
+        step_seconds=estimate.step_seconds[kept],
+    )

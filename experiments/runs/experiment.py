@@ -16,8 +16,8 @@ from omegaconf import OmegaConf
 
 from estimators.base import Estimator
 from experiments.runs import paths
-from experiments.runs.compose import composing, with_study_file
-from experiments.runs.key import applied, run_key, version_of
+from experiments.runs.compose import name_study_files, open_composer
+from experiments.runs.key import effective_config, run_key, version_of
 from experiments.runs.objects import OF_TEAMS, Objects, is_grid_file
 from experiments.runs.row import Row
 from experiments.runs.schema import (
@@ -30,7 +30,7 @@ from experiments.runs.schema import (
     with_leaf,
 )
 from experiments.runs.seeds import stream
-from experiments.runs.targets import checked
+from experiments.runs.targets import check_target
 from sim.errors import InputError, require
 from sim.options import build, find
 from sim.recording import Recording
@@ -44,10 +44,10 @@ class Experiment(Objects):
     @classmethod
     def compose(cls, overrides: Sequence[str] = ()) -> Experiment:
         """Compose an experiment from Hydra's overrides, such as `world=office seed=3`."""
-        with composing() as composer:
-            return cls(*composer.composed(with_study_file(overrides)).resolved())
+        with open_composer() as composer:
+            return cls(*composer.compose(name_study_files(overrides)).resolve())
 
-    def replaced(self, **values: Any) -> Experiment:
+    def replace(self, **values: Any) -> Experiment:
         """Return the experiment with other values of top-level keys, such as `seed=3`."""
         return dataclasses.replace(self, config={**self.config, **values})
 
@@ -58,18 +58,18 @@ class Experiment(Objects):
             config = with_leaf(config, leaf, value)
         return dataclasses.replace(self, config=config)
 
-    def using(self, estimator: Estimator) -> Experiment:
+    def with_estimator_object(self, estimator: Estimator) -> Experiment:
         """Return the experiment with an estimator that is not an option of the configuration."""
         kind = type(estimator)
         return dataclasses.replace(
-            self.replaced(estimator={"class": f"{kind.__module__}.{kind.__qualname__}"}),
+            self.replace(estimator={"class": f"{kind.__module__}.{kind.__qualname__}"}),
             choices={**self.choices, "estimator": kind.__name__},
             own_estimator=estimator,
         )
 
     def with_estimator(self, **settings: Any) -> Experiment:
         """Return the experiment with other values of keys of its estimator."""
-        return self.replaced(estimator={**self.config["estimator"], **settings})
+        return self.replace(estimator={**self.config["estimator"], **settings})
 
     def option(self, name: str, default: Any = None) -> Any:
         """An option of the estimator; `default` if it has none of this name."""
@@ -80,7 +80,7 @@ class Experiment(Objects):
         value = functools.reduce(operator.getitem, place.split("."), self.config)
         return {**value} if isinstance(value, dict) else {}
 
-    def over(self, recording: Recording) -> Experiment:
+    def with_recording(self, recording: Recording) -> Experiment:
         """Return the experiment over a recording in memory, identified by its checksum."""
         require(
             self.config["calibration"] is None,
@@ -88,7 +88,7 @@ class Experiment(Objects):
             "read_calibration(FILE).applied(recording)",
         )
         self._compare_slip(recording)
-        return self.replaced(recording={"checksum": recording.checksum})
+        return self.replace(recording={"checksum": recording.checksum})
 
     # What a run is called, and where its rows go
 
@@ -148,7 +148,7 @@ class Experiment(Objects):
 
         Settings that did not make the recording have no column.
         """
-        stated = applied(self.config)
+        stated = effective_config(self.config)
         brought = ("world", "sensors", "route") if self.from_file else ()
         choices = {g: name for g, name in self.choices.items() if g in stated and g not in brought}
         return {
@@ -178,7 +178,7 @@ class Experiment(Objects):
         self.robot()
         self.sensors()
         self.route()
-        checked(config["world"], "world", ("rng",))
+        check_target(config["world"], "world", ("rng",))
         stream(config["seed"], "slip")
         stream(config["world_seed"], "world", key="world_seed")
         self._check_team()
@@ -193,12 +193,12 @@ class Experiment(Objects):
         InputError
             Naming the option, and the remedy.
         """
-        checked(self.config["estimator"], "estimator")
+        check_target(self.config["estimator"], "estimator")
 
     def _check_needs(self) -> None:
         """Check that the estimator gets the sensors and the map that it needs."""
         settings = self.config["estimator"]
-        estimator = self.own_estimator or checked(settings, "estimator")
+        estimator = self.own_estimator or check_target(settings, "estimator")
         if str(settings.get("_target_")).startswith("estimators."):
             estimator = self.estimator()  # its values too; one from elsewhere may take long to make
         needs = frozenset(getattr(estimator, "needs", ()))
@@ -219,7 +219,7 @@ class Experiment(Objects):
         """Check that the prior's map can be made or read, and that the estimator can use it."""
         known_map = self.config["prior"]["map"]
         if isinstance(known_map, dict):
-            checked(known_map, "prior.map", ("config", "recording"))
+            check_target(known_map, "prior.map", ("config", "recording"))
         elif not is_grid_file(known_map):
             require(
                 known_map in ("none", "world"),
@@ -228,7 +228,7 @@ class Experiment(Objects):
             )
         else:
             grid_file.read_grid(known_map)
-            estimator = self.own_estimator or checked(self.config["estimator"], "estimator")
+            estimator = self.own_estimator or check_target(self.config["estimator"], "estimator")
             kinds = getattr(estimator, "maps", None) or [OccupancyGrid]
             require(
                 OccupancyGrid in kinds or self.option("map_path"),

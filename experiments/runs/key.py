@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments.runs.schema import SIMULATED_KEYS, Config, Leaf, leaves
-from experiments.runs.targets import targets
+from experiments.runs.targets import list_targets
 from experiments.runs.version import SIMULATION, code_version, source_digest, version_with
 from sim.errors import InputError
 from sim.worlds import grid_file
@@ -109,7 +109,7 @@ def recording_key(config: Config) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:24]
 
 
-def applied(config: Config) -> Config:
+def effective_config(config: Config) -> Config:
     """Settings without those of a simulation that a recording from a file takes the place of.
 
     A function that makes the recording or the map may read all of them.
@@ -122,7 +122,7 @@ def applied(config: Config) -> Config:
 
 def version_of(config: Config) -> str:
     """The code's version, and a digest of what the settings name from elsewhere."""
-    return version_with(targets(applied(config)), config["estimator"].get("command"))
+    return version_with(list_targets(effective_config(config)), config["estimator"].get("command"))
 
 
 def _recording_sources(config: Config) -> Config:
@@ -138,7 +138,7 @@ def _recording_sources(config: Config) -> Config:
         "feedback_files": files_of_options(config["route"].get("feedback")),
     }
     simulated = {key: config[key] for key in SIMULATED_KEYS}
-    elsewhere = {target: source_digest(target) for target in sorted(targets(simulated))}
+    elsewhere = {target: source_digest(target) for target in sorted(list_targets(simulated))}
     if any(elsewhere.values()):  # a sensor, route or world of one's own, edited: another one
         sources["sources"] = elsewhere
     if any(target.startswith("estimators.") for target in elsewhere):  # one on board

@@ -1,4 +1,4 @@
-"""What a configuration names: world, robots, sensors, routes, estimators, recordings and priors."""
+"""Builds what a configuration names: world, robots, estimators, recordings, priors."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import Any, Self, cast
 import numpy as np
 
 from estimators.base import Estimator, Prior, TeamEstimator
-from experiments.runs.cache import cached
+from experiments.runs.cache import fetch_or_make
 from experiments.runs.calibration import read_calibration
 from experiments.runs.key import recording_key
 from experiments.runs.schema import (
@@ -22,7 +22,7 @@ from experiments.runs.schema import (
     PriorOptions,
     SimulationOptions,
     TeamSettings,
-    own_config,
+    robot_config,
 )
 from experiments.runs.seeds import stream
 from experiments.runs.targets import make
@@ -123,7 +123,7 @@ class Objects:
         """The experiment of one robot of the team, alone, with what it has of its own."""
         if self.team is None:
             return self
-        return dataclasses.replace(self, config=own_config(self.config, self.team, number))
+        return dataclasses.replace(self, config=robot_config(self.config, self.team, number))
 
     def route(self) -> Any:
         """Make the route: anything with `start`, as in `sim.simulate.Route`."""
@@ -131,7 +131,7 @@ class Objects:
 
     # What they record
 
-    def simulated(
+    def simulate_team(
         self,
         on_progress: Callable[[float], None] | None = None,
         streams: Mapping[str, np.random.Generator] | None = None,
@@ -167,7 +167,7 @@ class Objects:
     ) -> Recording:
         """Simulate the recording of one robot, as `simulated` does."""
         self._check_one_robot()
-        return self.simulated(on_progress, streams).only
+        return self.simulate_team(on_progress, streams).only
 
     def recordings(self, on_progress: Callable[[float], None] | None = None) -> Team:
         """Read the recordings, find them in the cache, or simulate them.
@@ -187,10 +187,12 @@ class Objects:
             return Team((self._calibrated(made),))
         if wanted is not None:
             return self._loaded(Path(wanted))
-        simulate = functools.cache(lambda: self.simulated(on_progress))
+        simulate = functools.cache(lambda: self.simulate_team(on_progress))
 
         def of_robot(number: int) -> Recording:
-            found = cached(f"{self.recording_key}-{number}", lambda: simulate().robots[number])
+            found = fetch_or_make(
+                f"{self.recording_key}-{number}", lambda: simulate().robots[number]
+            )
             # a file does not choose what code runs, but the configuration does
             return dataclasses.replace(found, sensors=self.of_robot(number).sensors())
 
@@ -259,7 +261,7 @@ class Objects:
     def _calibrated(self, recording: Recording) -> Recording:
         """Return the recording as the calibration has it."""
         path = self.config["calibration"]
-        return recording if path is None else read_calibration(Path(path)).applied(recording)
+        return recording if path is None else read_calibration(Path(path)).apply(recording)
 
     def _with_classes(self, recording: Recording) -> Recording:
         """Return the recording with the classes of its sensors that the configuration names too."""

@@ -13,7 +13,7 @@ from sim.files import require_file
 
 
 @contextmanager
-def held_interrupts() -> Iterator[Callable[..., None]]:
+def hold_interrupts() -> Iterator[Callable[..., None]]:
     """Yield a function that raises the interrupt that has come meanwhile, if any.
 
     It takes any arguments, so that it can be called as progress is. The end of the context raises
@@ -51,7 +51,7 @@ def held_interrupts() -> Iterator[Callable[..., None]]:
 
 
 @contextmanager
-def locked(lock: Path, *, wait: bool = True) -> Iterator[None]:
+def hold_lock(lock: Path, *, wait: bool = True) -> Iterator[None]:
     """Hold an exclusive lock, by a file that goes with it; the system frees it if its holder dies.
 
     The file is opened to be written, since a lock on a network file system asks for that. Who

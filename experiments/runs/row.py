@@ -122,7 +122,7 @@ def read_rows(path: Path, remedy: str = "", texts: Sequence[str] = ()) -> pd.Dat
         files = sorted(file for file in path.glob("*.parquet") if file.name[0] != ".")
     require(files and path.exists(), f"{path}: no results here; run the study first")
     if path.is_dir():
-        return joined([read_parquet(file, remedy=remedy) for file in files])
+        return concatenate([read_parquet(file, remedy=remedy) for file in files])
     if path.suffix != ".csv":
         return read_parquet(path, remedy=remedy).to_pandas(use_threads=False)
     require_file(path)
@@ -176,7 +176,7 @@ def _reading(path: Path, remedy: str) -> Iterator[None]:
         raise InputError(f"{path}: cannot read this table ({why}); {remedy or usual}") from error
 
 
-def as_tables(rows: Iterable[Row]) -> list[pa.Table]:
+def to_tables(rows: Iterable[Row]) -> list[pa.Table]:
     """Rows as tables, each of rows with the same columns and types.
 
     So what a table of all of them looks like does not depend on which rows were written together.
@@ -197,7 +197,7 @@ def as_tables(rows: Iterable[Row]) -> list[pa.Table]:
     return [pa.Table.from_pylist(group, schema(columns)) for columns, group in groups.items()]
 
 
-def joined(tables: Sequence[pa.Table]) -> pd.DataFrame:
+def concatenate(tables: Sequence[pa.Table]) -> pd.DataFrame:
     """One table of all rows; a column that some tables lack is empty there.
 
     A column that mixes numbers, text or booleans becomes text.

@@ -18,14 +18,14 @@ from experiments.runs.columns import COLUMNS, REVISED
 from experiments.runs.compose import (
     CommandLine,
     check_hydra,
-    composing,
+    name_study_files,
+    open_composer,
     searched,
-    with_study_file,
 )
 from experiments.runs.console import RunFailedError, progress, show
 from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
-from experiments.runs.processes import held_interrupts
+from experiments.runs.processes import hold_interrupts
 from experiments.runs.row import Outcome, Row
 from experiments.runs.store import write_run
 from experiments.trajectories.convert import write_estimate
@@ -61,7 +61,7 @@ def run_once(experiment: Experiment, draw: Draw, out: Path | None = None) -> lis
     found: list[tuple[Recording, Estimate]] = []
 
     def fetch() -> Team:
-        with shown("simulated seconds", expected_s(experiment)) as on_progress:
+        with shown("simulated seconds", expected_duration_s(experiment)) as on_progress:
             read = experiment.recordings(on_progress)
         slip = experiment.believed_slip
         if (
@@ -71,7 +71,7 @@ def run_once(experiment: Experiment, draw: Draw, out: Path | None = None) -> lis
             and experiment.config["calibration"] is None
         ):
             show(
-                f"believed of this real robot: kr={slip[0]:g} and kl={slip[1]:g} m, and the "
+                f"assumed for this real robot: kr={slip[0]:g} and kl={slip[1]:g} m, and the "
                 "geometry that the log's reader assumes; to find its own: "
                 "estima calibrate LOG -o cal.yaml, then calibration=cal.yaml"
             )
@@ -81,7 +81,7 @@ def run_once(experiment: Experiment, draw: Draw, out: Path | None = None) -> lis
         if repeat == 0:
             found.append((recording, online if revised is None else revised))
 
-    with held_interrupts() as interrupt:
+    with hold_interrupts() as interrupt:
 
         @contextmanager
         def shown(label: str, total: float | None) -> Iterator[Callable[[float], None]]:
@@ -112,7 +112,7 @@ def run_once(experiment: Experiment, draw: Draw, out: Path | None = None) -> lis
     return rows
 
 
-def expected_s(experiment: Experiment) -> float | None:
+def expected_duration_s(experiment: Experiment) -> float | None:
     """About how long the simulated drive will be; None if that is not known before."""
     one = experiment.of_robot(0)
     about_s = None if experiment.from_file else getattr(one.route(), "about_s", None)
@@ -122,8 +122,8 @@ def expected_s(experiment: Experiment) -> float | None:
 def record(experiment: Experiment, out: Path) -> bool:
     """Simulate what an experiment reads, save it and say so; return whether all drives were ok."""
     require(out.suffix == ".npz", f"{out}: a recording is an .npz file")
-    with progress("simulated seconds", expected_s(experiment)) as on_progress:
-        made = experiment.simulated(on_progress)
+    with progress("simulated seconds", expected_duration_s(experiment)) as on_progress:
+        made = experiment.simulate_team(on_progress)
     checksum = save(made, out)
     drives = [f"{robot.status}, {robot.duration_s:.1f} s" for robot in made.robots]
     if experiment.team is not None:
@@ -145,15 +145,15 @@ def application(arguments: Sequence[str], draw: Draw, out: Path | None = None) -
     """
     line = CommandLine.of(arguments)
     check_hydra(line.overrides)
-    with composing(searched(line.config_dir)) as composer:
-        found = composer.composed(with_study_file(line.overrides))
+    with open_composer(searched(line.config_dir)) as composer:
+        found = composer.compose(name_study_files(line.overrides))
     if line.shown:
         print(OmegaConf.to_yaml(found.cfg, resolve=line.resolved))
         return
     if found.cfg.get("sweeps") or found.params:
         study = found.choices.get("study")
         raise InputError(f"study={study} sweeps values; add -m: estima run -m study={study}")
-    experiment = Experiment(*found.resolved())
+    experiment = Experiment(*found.resolve())
     run_once(experiment, draw, out)
     _say_next(experiment, line)
 
@@ -203,7 +203,7 @@ def _print(rows: Sequence[Row], files: Sequence[Path]) -> None:
         how_many = f"{len(failed)} of {len(rows)} repeats " if len(rows) > 1 else ""
         status = f": {how_many}failed, {failed[0]['status_detail']}"
     show(f"{first['choice.estimator']} on {where}, seed {first['seed']}{status}")
-    if words := in_words(sound):
+    if words := summarize(sound):
         show(f"  {words}")
     if first.get("stamps_left_out"):
         scored, left_out = first["stamps_scored"], first["stamps_left_out"]
@@ -219,7 +219,7 @@ def _print(rows: Sequence[Row], files: Sequence[Path]) -> None:
         show(f"  remark: {first['status_detail']}")
 
 
-def in_words(rows: Sequence[Row]) -> str:
+def summarize(rows: Sequence[Row]) -> str:
     """What came out, in a sentence; errors over repeats are pooled by squares."""
 
     def mean(name: str, power: int = 1) -> float:

@@ -118,21 +118,21 @@ KEYS = (*_MAPPINGS, "seed", "world_seed", "recording", "calibration", "name")
 KEYS += ("repeats", "keep", "picture")
 
 
-def unknown(key: str, known: Iterable[str]) -> str:
+def describe_unknown(key: str, known: Iterable[str]) -> str:
     """Say that a key is unknown, and which ones are known, the nearest spelled first."""
     names = list(known)
     near = difflib.get_close_matches(key, names, n=3)
     return f"unknown key {key}; known: {', '.join(dict.fromkeys([*near, *names])) or 'none'}"
 
 
-def unknown_key(key: str, config: Mapping[str, Any]) -> str:
+def describe_unknown_key(key: str, config: Mapping[str, Any]) -> str:
     """Say that a key is unknown, and which ones are known next to it."""
     place = ""
     for part in key.split(".")[:-1]:
         if not isinstance(config.get(part), Mapping):
             break
         place, config = f"{place}{part}.", config[part]
-    return unknown(key, (f"{place}{name}" for name in config if name != "hydra"))
+    return describe_unknown(key, (f"{place}{name}" for name in config if name != "hydra"))
 
 
 def leaves(tree: Mapping[str, Any], above: Leaf = ()) -> Iterator[tuple[Leaf, Any]]:
@@ -321,7 +321,7 @@ def _holds_nan(value: Any) -> bool:
     return isinstance(value, float) and math.isnan(value)
 
 
-def own_config(config: Config, settings: TeamSettings, number: int) -> Config:
+def robot_config(config: Config, settings: TeamSettings, number: int) -> Config:
     """Configuration of one of the robots, which has no key `team`.
 
     Raises
@@ -335,6 +335,8 @@ def own_config(config: Config, settings: TeamSettings, number: int) -> Config:
         require(group in _OWN, f"unknown key {where}; known: {', '.join(_OWN)}")
         require(isinstance(values, Mapping), f"{where} must hold keys, got {values!r}")
         for key in [key for key in values if key not in own[group]]:
-            raise InputError(unknown(f"{where}.{key}", (f"{where}.{name}" for name in own[group])))
+            raise InputError(
+                describe_unknown(f"{where}.{key}", (f"{where}.{name}" for name in own[group]))
+            )
         own[group] = {**own[group], **values}
     return own

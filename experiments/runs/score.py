@@ -23,7 +23,7 @@ from experiments.evaluation.metrics import (
     relative_errors,
     rms,
 )
-from experiments.evaluation.time_sync import Rows, nearest
+from experiments.evaluation.time_sync import Rows, nearest_rows
 from experiments.runs.columns import OF_THE_RUN, REVISED
 from experiments.runs.evaluate import status_of_pauses
 from experiments.runs.experiment import rows_folder
@@ -63,7 +63,7 @@ class Scoring:
 
 
 @dataclass(frozen=True)
-class Scored:
+class ScoredTrajectory:
     """A trajectory beside the truth.
 
     Attributes
@@ -88,7 +88,7 @@ class Scored:
     longest_gap_s: float
 
 
-def scored_against(recording: Recording, given: Estimate, how: Scoring) -> Scored:
+def match_and_align(recording: Recording, given: Estimate, how: Scoring) -> ScoredTrajectory:
     """Match a trajectory with the truth, and move it.
 
     Raises
@@ -124,14 +124,16 @@ def scored_against(recording: Recording, given: Estimate, how: Scoring) -> Score
     poses, covariances = se2.compose(T, means), turn @ covariances @ turn.T
     moved = Estimate(stamps[rows], poses, covariances, left_out=given.left_out)
     pause_s = longest_pause_s(stamps[rows], start, end)
-    return Scored(moved, truth, T, len(stamps), len(stamps) - len(np.unique(rows)), pause_s)
+    return ScoredTrajectory(
+        moved, truth, T, len(stamps), len(stamps) - len(np.unique(rows)), pause_s
+    )
 
 
 def _associated(stamps: Array, true_stamps: Array, tolerance_s: float) -> tuple[Rows, Rows]:
     """Rows of both that belong together, as evo finds them: nearest stamps of the shorter one."""
     longer = len(stamps) > len(true_stamps)  # of equally many, those of the trajectory are sought
     short, long = (true_stamps, stamps) if longer else (stamps, true_stamps)
-    rows = nearest(long, short)
+    rows = nearest_rows(long, short)
     near = np.abs(long[rows] - short) <= tolerance_s
     pair: tuple[Rows, Rows] = np.flatnonzero(near), rows[near]
     return (pair[1], pair[0]) if longer else pair
@@ -145,7 +147,7 @@ def statistics(errors: Array) -> dict[str, float]:
     return {name: float(value) for name, value in found.items()}
 
 
-def error_table(scored: Scored) -> dict[str, dict[str, float]]:
+def error_table(scored: ScoredTrajectory) -> dict[str, dict[str, float]]:
     """Statistics of each error; those over a distance only where the truth is that long."""
     truth, means = scored.truth, scored.estimate.means
     found = {
@@ -164,7 +166,7 @@ def error_table(scored: Scored) -> dict[str, dict[str, float]]:
 
 def row_of(
     recording: Recording,
-    scored: Scored,
+    scored: ScoredTrajectory,
     how: Scoring,
     *,
     files: tuple[Path, Path],
@@ -221,7 +223,7 @@ def score_files(
     topic: str | None = None,
     estimator: str | None = None,
     name: str = "score",
-) -> list[tuple[Path, Row, Scored]]:
+) -> list[tuple[Path, Row, ScoredTrajectory]]:
     """Score trajectories of a recording's file, and write their rows to results/runs/NAME.
 
     Parameters
@@ -243,7 +245,7 @@ def score_files(
     for trajectory, called in zip(trajectories, names, strict=True):
         given = read_trajectory(trajectory, topic)
         try:
-            scored = scored_against(recording, given, how)
+            scored = match_and_align(recording, given, how)
         except InputError as error:
             raise InputError(f"{trajectory}: {error}") from error
         row = row_of(recording, scored, how, files=(path, trajectory), estimator=called, name=name)
@@ -253,17 +255,17 @@ def score_files(
     return results
 
 
-def as_text(scored: Scored, how: Scoring) -> str:
+def as_text(scored: ScoredTrajectory, how: Scoring) -> str:
     """Say what was scored, and the statistics of its errors."""
     errors = error_table(scored)
     heads = list(next(iter(errors.values())))
     lines = [f"  {'':<24}" + "".join(f"{head:>19}" for head in heads)]
     for error, values in errors.items():
         lines.append(f"  {error:<24}" + "".join(f"{values[head]:>19.12g}" for head in heads))
-    return "\n".join([described(scored, how), *lines])
+    return "\n".join([describe_scoring(scored, how), *lines])
 
 
-def described(scored: Scored, how: Scoring) -> str:
+def describe_scoring(scored: ScoredTrajectory, how: Scoring) -> str:
     """Say what was scored: stamps, gaps, alignment."""
     stamps = scored.estimate.stamps
     matching = (

@@ -22,16 +22,16 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 
 from experiments.runs.columns import REPEAT
-from experiments.runs.processes import locked
+from experiments.runs.processes import hold_lock
 from experiments.runs.row import (
     WITH_DIGEST,
     Outcome,
     Row,
-    as_tables,
     check_row,
-    joined,
+    concatenate,
     read_parquet,
     read_rows,
+    to_tables,
 )
 from sim.errors import InputError, require
 from sim.files import require_file, write_whole
@@ -108,7 +108,7 @@ def journal(path: Path) -> closing[Journal]:
 
 
 @dataclass(frozen=True)
-class Ended:
+class Outcomes:
     """How runs ended.
 
     Attributes
@@ -138,7 +138,7 @@ def read_runs(path: Path) -> pd.DataFrame:
         table = read_rows(path)
         require(len(table), f"{path}: a table of no rows; delete it")
         return table
-    table = joined(tables)
+    table = concatenate(tables)
     known = {"run_key", "status", REPEAT} <= set(table)
     if not known or not table.duplicated(["run_key", REPEAT]).any():
         return table
@@ -148,7 +148,7 @@ def read_runs(path: Path) -> pd.DataFrame:
     return table.iloc[order].drop_duplicates(["run_key", REPEAT], keep="last", ignore_index=True)
 
 
-def ended(folder: Path, prefix: str = "", damaged: Any = None) -> Ended:
+def ended(folder: Path, prefix: str = "", damaged: Any = None) -> Outcomes:
     """How the runs of a folder ended, by their status columns alone.
 
     Parameters
@@ -181,10 +181,10 @@ def ended(folder: Path, prefix: str = "", damaged: Any = None) -> Ended:
     places = np.array(list(failed), np.uint64)
     for key in places[np.isin(places, whole)].tolist():
         del failed[key]
-    return Ended(whole, failed)
+    return Outcomes(whole, failed)
 
 
-def begun(folder: Path, prefix: str) -> set[int]:
+def find_begun_runs(folder: Path, prefix: str) -> set[int]:
     """Keys of the runs that some journal shows as begun and not ended, as numbers."""
     found = set()
     for path in folder.glob(f"{prefix}*{JOURNAL}"):
@@ -233,7 +233,7 @@ def _is_flat(row: Any) -> bool:
     return isinstance(row, dict) and not any(isinstance(v, (list, dict)) for v in row.values())
 
 
-def is_own(path: Path) -> bool:
+def has_checksum(path: Path) -> bool:
     """Whether a file of rows carries checksums: a journal, or a name with a digest."""
     return path.suffix == JOURNAL or WITH_DIGEST.fullmatch(path.name) is not None
 
@@ -251,7 +251,7 @@ def write_run(rows: Sequence[Row], folder: Path) -> Path:
         check_row(row)
     key = str(rows[0]["run_key"])
     former = set(folder.glob(f"{key}*.parquet"))
-    paths = [write_table(table, folder / key) for table in as_tables(rows)]
+    paths = [write_table(table, folder / key) for table in to_tables(rows)]
     for path in former.difference(paths):
         path.unlink(missing_ok=True)
     return paths[0]
@@ -280,7 +280,7 @@ def tidy(folder: Path, is_live: Any) -> None:
     """
     if not folder.is_dir():
         return
-    with locked(folder / ".tidy.lock"):
+    with hold_lock(folder / ".tidy.lock"):
         for path in sorted(folder.glob(f"*{JOURNAL}")):
             if not is_live(path.name):
                 compact(path)
@@ -335,7 +335,7 @@ def _tables(path: Path, columns: list[str] | None = None) -> list[pa.Table]:
         return [read_parquet(p, columns) for p in path.parent.glob(f"{path.stem}.*.parquet")]
     except OSError as error:
         raise InputError(f"{path}: cannot read it ({error.strerror}); remove it") from error
-    return as_tables(row for _, rows in journal_lines(content) for row in rows)
+    return to_tables(row for _, rows in journal_lines(content) for row in rows)
 
 
 def _as_numbers(keys: pa.ChunkedArray) -> NDArray[np.uint64]:

@@ -25,7 +25,7 @@ def make(settings: Mapping[str, Any], where: str, **injected: Any) -> Any:
     InputError
         If the target cannot be found, or a key is unknown or missing.
     """
-    function = checked(settings, where, injected)
+    function = check_target(settings, where, injected)
     arguments = {key: value for key, value in settings.items() if key != "_target_"}
     known = inspect.signature(function).parameters
     try:
@@ -36,7 +36,7 @@ def make(settings: Mapping[str, Any], where: str, **injected: Any) -> Any:
         ) from error
 
 
-def checked(
+def check_target(
     settings: Mapping[str, Any], where: str, injected: Collection[str] = ()
 ) -> Callable[..., Any]:
     """Return what `_target_` names, if it takes the other keys; `make` says more.
@@ -71,9 +71,9 @@ def checked(
     return function
 
 
-def targets(tree: Any) -> set[str]:
+def list_targets(tree: Any) -> set[str]:
     """Every `_target_` of a configuration."""
     if not isinstance(tree, Mapping):
         return set()
     here = {tree["_target_"]} if isinstance(tree.get("_target_"), str) else set()
-    return here.union(*(targets(value) for value in tree.values()))
+    return here.union(*(list_targets(value) for value in tree.values()))

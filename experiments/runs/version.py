@@ -105,7 +105,7 @@ def _with_imports(module: Path) -> list[Path]:
     return sorted({module, *(Path(file) for file in files if file)})
 
 
-def machine() -> dict[str, str | int]:
+def describe_machine() -> dict[str, str | int]:
     """Processor, core count and versions."""
     import numba
     import numpy as np

@@ -13,7 +13,7 @@ import pandas as pd
 from hydra.errors import HydraException, MissingConfigException
 
 from experiments.runs.columns import REPEAT, is_setting
-from experiments.runs.compose import option_called, searched
+from experiments.runs.compose import find_option, searched
 from experiments.runs.experiment import Experiment
 from experiments.runs.store import read_runs
 from experiments.sweeps.collect import commands, folder_of
@@ -27,7 +27,7 @@ _SHORT = 10  # digits of a key that tell tens of thousands of runs apart
 
 
 @dataclass(frozen=True)
-class Again:
+class RecordedRun:
     """An experiment of a sweep, which of its repeats, and the checksum of its recording."""
 
     experiment: Experiment
@@ -43,7 +43,7 @@ class Again:
             If it is no longer the same.
         """
         read = self.experiment.recordings()
-        require(read.checksum == self.checksum, "the recording of the run is not what it was")
+        require(read.checksum == self.checksum, "the run's recording has changed")
         return read
 
 
@@ -85,9 +85,9 @@ def noted_config_dir(folder: Path) -> str | None:
     return None
 
 
-def run_again(
+def run_of_row(
     row: pd.Series[Any], config_dir: str | Path | None = None, noted: str | None = None
-) -> Again:
+) -> RecordedRun:
     """The experiment that left a row.
 
     Parameters
@@ -107,7 +107,7 @@ def run_again(
     if config_dir is None and noted is not None and Path(noted).is_dir():
         config_dir = noted
     choices = [
-        f"{group}={option_called(group, name, config_dir)}"
+        f"{group}={find_option(group, name, config_dir)}"
         for group, name in chosen.items()
         if isinstance(name, str)
     ]
@@ -139,10 +139,10 @@ def run_again(
         made["code_version"] == row["code_version"],
         f"it comes from another version of the code, {row['code_version']}; run the sweep again",
     )
-    return Again(again, int(row[REPEAT]), str(row["recording_checksum"]))
+    return RecordedRun(again, int(row[REPEAT]), str(row["recording_checksum"]))
 
 
-def draw_again(
+def draw_recorded_run(
     row: pd.Series[Any],
     how: Showing,
     called: str,
@@ -159,7 +159,7 @@ def draw_again(
         A folder of further options, and that of the sweep's rows, by default that of NAME.
     """
     noted = noted_config_dir(folder_of(folder or str(Path(called).parent)))
-    again = run_again(row, config_dir, noted)
+    again = run_of_row(row, config_dir, noted)
     name = again.experiment.estimator_name
 
     def estimated(shown: Playback, on_step: OnStep) -> Playback:

@@ -18,7 +18,7 @@ from experiments.evaluation.statistics import paired_p
 from experiments.runs.columns import REPEAT, Average, average_of, title
 
 RECORDING = "recording_checksum"
-LEAST = 3  # units of an interval: of two, Student's t makes it 13 standard errors
+MIN_UNITS = 3  # units of an interval: of two, Student's t makes it 13 standard errors
 
 
 def rule(
@@ -39,7 +39,7 @@ def rule(
     if all(bounded):
         interval = " [95 % interval]"
     else:
-        interval = f" [95 % interval of {LEAST} or more]" if any(bounded) else ""
+        interval = f" [95 % interval of {MIN_UNITS} or more]" if any(bounded) else ""
     kinds = {average_of(name) for name in names}
     if kinds == {Average.PLAIN}:
         return f"Arithmetic mean over {over}{interval}"
@@ -59,7 +59,7 @@ def unit_of(table: pd.DataFrame, by: Sequence[str]) -> str:
     return REPEAT if alone and groups[REPEAT].nunique().max() > 1 else RECORDING
 
 
-def pooled(
+def pool_repeats(
     table: pd.DataFrame, by: Sequence[str], name: str, settings: Sequence[str] = ()
 ) -> pd.Series[float]:
     """One value of a column for each group, over all rows that have one; `by` holds the unit.
@@ -96,12 +96,12 @@ def averages(
     DataFrame
         Columns `value`, `low` and `high`; one row a group that has a value.
     """
-    values = pooled(table, [*by, unit], name, settings)
+    values = pool_repeats(table, [*by, unit], name, settings)
     geometric = average_of(name) is not Average.PLAIN
     with np.errstate(divide="ignore", invalid="ignore"):
         groups = (np.log(values) if geometric else values).groupby(level=list(range(len(by))))
         mean, n = groups.mean(), groups.size()
-        half = stats.t.ppf(0.975, n - 1) * groups.std() / np.sqrt(n.where(n >= LEAST))
+        half = stats.t.ppf(0.975, n - 1) * groups.std() / np.sqrt(n.where(n >= MIN_UNITS))
     means = pd.DataFrame({"value": mean, "low": mean - half, "high": mean + half})
     if geometric:
         return np.exp(means)

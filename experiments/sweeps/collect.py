@@ -20,7 +20,7 @@ from experiments.runs.columns import (
     STATUS,
     is_setting,
 )
-from experiments.runs.console import counted
+from experiments.runs.console import pluralize
 from experiments.runs.paths import results
 from experiments.runs.store import read_runs
 from experiments.runs.version import code_version, version_with
@@ -59,7 +59,7 @@ def collect(name: str, *, all_versions: bool = False, times: bool = False) -> pd
         require(column in table, f"{path}: not rows of runs, column {column} is missing")
     for column in (*STATUS, *ORIGIN):
         sound = column not in table or pd.api.types.is_string_dtype(table[column])
-        require(sound, f"{path}: not rows of runs, column {column} holds no texts")
+        require(sound, f"{path}: not rows of runs, column {column} is not text")
     if not all_versions:
         mine = _of_this_code(table)
         require(
@@ -68,21 +68,21 @@ def collect(name: str, *, all_versions: bool = False, times: bool = False) -> pd
             "them with those of all versions",
         )
         if not mine.all():
-            left_out = counted((~mine).sum(), "row")
+            left_out = pluralize((~mine).sum(), "row")
             print(f"left out {left_out} of other versions of the code", file=sys.stderr)
         table = table[mine]
-    for n_runs, command in unfinished(path):
-        here = counted(table["run_key"].nunique(), "run")
+    for n_runs, command in unfinished_sweeps(path):
+        here = pluralize(table["run_key"].nunique(), "run")
         words = f"{here} so far: the sweep of {n_runs} is unfinished; to go on: {command}"
         print(printable(words), file=sys.stderr)
-    settings = swept(table)
+    settings = swept_settings(table)
     _check_distinct(table, settings, path)
     if not times:
         table = table.drop(columns=_TIMES, errors="ignore")
     return table.sort_values([*settings, "run_key", REPEAT], kind="stable", ignore_index=True)
 
 
-def unfinished(folder: Path) -> list[tuple[str, str]]:
+def unfinished_sweeps(folder: Path) -> list[tuple[str, str]]:
     """Sweeps of a folder that have not ended: how many runs each has, and its command."""
     texts = [
         path.read_text(encoding="utf-8", errors="replace")
@@ -146,7 +146,7 @@ def where(table: pd.DataFrame, conditions: Sequence[str]) -> pd.DataFrame:
     for condition in conditions:
         column, equals, wanted = condition.partition("=")
         if not equals:
-            there = dozen([*map(str, table)])
+            there = first_names([*map(str, table)])
             raise InputError(f"condition {condition}: give COLUMN=VALUE; columns: {there}")
         if column not in table:
             raise InputError(f"condition {condition}: {no_column(table, column, metric=False)}")
@@ -185,19 +185,19 @@ def _of_this_code(table: pd.DataFrame) -> pd.Series[bool]:
     return mine
 
 
-def swept(table: pd.DataFrame) -> list[str]:
+def swept_settings(table: pd.DataFrame) -> list[str]:
     """Settings that differ between the rows."""
     return [c for c in table if is_setting(c) and table[c].nunique(dropna=False) > 1]
 
 
-def telling(table: pd.DataFrame) -> list[str]:
+def distinguishing_settings(table: pd.DataFrame) -> list[str]:
     """Swept settings without those that follow from earlier ones, as kl may from kr.
 
     Of rows of several versions of the code, the version is one.
     """
     kept: list[str] = []
     n_groups = 1
-    for column in [*swept(table), *({"code_version"} & {*table})]:
+    for column in [*swept_settings(table), *({"code_version"} & {*table})]:
         finer = table.groupby([*kept, column], dropna=False).ngroups
         if finer > n_groups:
             kept.append(column)
@@ -205,13 +205,13 @@ def telling(table: pd.DataFrame) -> list[str]:
     return kept
 
 
-def suggested(table: pd.DataFrame, taken: Sequence[str] = ()) -> list[str]:
+def suggest_axes(table: pd.DataFrame, taken: Sequence[str] = ()) -> list[str]:
     """Settings to draw a sweep by, one at least: for the x axis, then for colours and panels.
 
     First come numbers that all runs have, then the estimator and other words; none that is taken.
     Words of more values than there are colours come before all.
     """
-    settings = [name for name in telling(table) if name not in taken]
+    settings = [name for name in distinguishing_settings(table) if name not in taken]
     kinds = [name for name in settings if name not in DRAWN]
     numbers = [n for n in kinds if table[n].dtype.kind in "fi" and table[n].notna().all()]
     words = sorted(
@@ -222,7 +222,7 @@ def suggested(table: pd.DataFrame, taken: Sequence[str] = ()) -> list[str]:
     return [x, *(n for n in [*words, *numbers] if n != x and table[n].nunique() <= FEW)]
 
 
-def measured(table: pd.DataFrame) -> list[str]:
+def result_columns(table: pd.DataFrame) -> list[str]:
     """Results of the runs: columns of numbers that are neither settings nor origin."""
     numbers = table.select_dtypes(["integer", "floating"])
     return [c for c in numbers if not is_setting(c) and c not in (REPEAT, *ORIGIN)]
@@ -230,17 +230,19 @@ def measured(table: pd.DataFrame) -> list[str]:
 
 def no_column(table: pd.DataFrame, wanted: str, *, metric: bool) -> InputError:
     """Say that a column, or a result, is not there, and which are, those like it first."""
-    results_ = measured(table)
+    results_ = result_columns(table)
     answers = [f"{ANSWER}{name}" for name in results_ if f"{ANSWER}{name}" in COLUMNS]
-    known = [*answers, *results_] if metric else [*telling(table), *results_, *table]
+    known = (
+        [*answers, *results_] if metric else [*distinguishing_settings(table), *results_, *table]
+    )
     near = [name for name in known if wanted.rpartition(".")[2].lower() in name]
     near += get_close_matches(wanted, known, n=5)
     meant = f"did you mean {near[0]}? " if near else ""
-    there = dozen(list(dict.fromkeys([*near, *known])))
+    there = first_names(list(dict.fromkeys([*near, *known])))
     return InputError(f"the sweep has no column {wanted}; {meant}there are {there}")
 
 
-def dozen(names: Sequence[str]) -> str:
+def first_names(names: Sequence[str]) -> str:
     """The first dozen names, and how many more there are."""
     more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
     return ", ".join(names[:_NAMED]) + more

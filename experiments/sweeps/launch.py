@@ -28,12 +28,19 @@ from omegaconf import DictConfig
 
 from experiments.runs import paths, store
 from experiments.runs.compose import CommandLine, check_hydra
-from experiments.runs.console import RunFailedError, counted, progress
+from experiments.runs.console import RunFailedError, pluralize, progress
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Outcome, Status
 from experiments.sweeps.collect import COMMAND, UNFINISHED, commands
-from experiments.sweeps.plan import Numbers, Plan, packed, plan_of
-from experiments.sweeps.work import compiling_file, end_with, failure, is_there, run_share, share_of
+from experiments.sweeps.plan import Numbers, Plan, make_plan, pack_jobs
+from experiments.sweeps.work import (
+    compiling_file,
+    end_with,
+    failure_row,
+    is_alive,
+    run_share,
+    share_path,
+)
 from sim.compiled import ANNOUNCED, note_compiling
 from sim.errors import InputError, require
 from sim.files import require_file, write_text
@@ -82,7 +89,7 @@ def sweep(
     _check_launcher(launching)
     n_jobs = _n_jobs(launching)
     own = [a for a in arguments if a not in launching]
-    plan = plan_of(own, config_dir)
+    plan = make_plan(own, config_dir)
     require(len(plan.keys), f"no runs: a value of {' '.join(own)} is an empty range or list")
     plan = plan.called(_name(plan, own, config_dir))
     folder = plan.experiment(0).rows_folder
@@ -98,7 +105,7 @@ def sweep(
     command = _note_command(folder, arguments, config_dir)
     unfinished = folder / UNFINISHED.format(hashlib.sha256(command.encode()).hexdigest()[:8])
     print(
-        f"{counted(len(keys), 'run')}, {done.sum()} of them done before: {paths.short(folder)}",
+        f"{pluralize(len(keys), 'run')}, {done.sum()} of them done before: {paths.short(folder)}",
         file=sys.stderr,
     )
     if not len(runs):
@@ -161,7 +168,7 @@ def _drop(path: Path, error: InputError) -> None:
 
     Nor one that cannot be read now: its rows may be sound.
     """
-    if not store.is_own(path) or isinstance(error.__cause__, OSError):
+    if not store.has_checksum(path) or isinstance(error.__cause__, OSError):
         raise error
     print(f"estima: {path} does not match its checksum; its runs are done again", file=sys.stderr)
     path.unlink(missing_ok=True)
@@ -206,7 +213,7 @@ class Jobs:
             "journal": str(journal),
             "families": plan.as_json(runs),
         }
-        write_text(share_of(self.plan, number), json.dumps(share))
+        write_text(share_path(self.plan, number), json.dumps(share))
         return str(number)
 
 
@@ -220,7 +227,7 @@ def _launch_all(plan: Plan, runs: Numbers, jobs: Jobs, launching: Sequence[str])
                 died = _launch(plan, left, jobs, launching)
                 if died is None:
                     return
-                begun = store.begun(jobs.folder, f"rows-{jobs.name}")
+                begun = store.find_begun_runs(jobs.folder, f"rows-{jobs.name}")
                 if not begun:
                     raise died
                 for i in left[np.isin(plan.keys[left], np.array(list(begun), np.uint64))]:
@@ -245,7 +252,7 @@ def _launch(plan: Plan, runs: Numbers, jobs: Jobs, launching: Sequence[str]) -> 
     """
     from joblib.externals.loky.process_executor import TerminatedWorkerError
 
-    parts = packed(plan.recordings[runs], jobs.count)
+    parts = pack_jobs(plan.recordings[runs], jobs.count)
     numbers = [jobs.add(plan, runs[part]) for part in parts]
     arguments, os.environ["HYDRA_FULL_ERROR"] = sys.argv, "1"  # its errors come to the caller
     sys.argv = [
@@ -276,7 +283,7 @@ def _launch(plan: Plan, runs: Numbers, jobs: Jobs, launching: Sequence[str]) -> 
 
 
 def _for_cluster(launching: Sequence[str]) -> list[str]:
-    """What makes Ray's launcher leave out a setting that a running cluster refuses."""
+    """Overrides that make Ray's launcher omit a setting that a running cluster rejects."""
     memory = "hydra.launcher.ray.init.object_store_memory"
     given = {argument.lstrip("+").partition("=")[0] for argument in launching}
     if "hydra.launcher.ray.init.address" in given and memory not in given:
@@ -301,7 +308,7 @@ def prepare(folder: Path) -> None:
         require_file(plan)
         try:
             node, planner = json.loads(plan.read_text())["planner"]
-            if node != platform.node() or is_there(planner):
+            if node != platform.node() or is_alive(planner):
                 continue
         except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
             continue
@@ -357,7 +364,7 @@ def _n_jobs(launching: Sequence[str]) -> int:
 def job_application(cfg: DictConfig) -> None:
     """Read one job's share of the plan, and run it."""
     try:
-        share = json.loads(share_of(cfg.plan, cfg.job).read_text())
+        share = json.loads(share_path(cfg.plan, cfg.job).read_text())
     except OSError as error:
         raise InputError(f"{cfg.plan}: the plan is gone; start the sweep again") from error
     end_with(*share["planner"])
@@ -373,7 +380,7 @@ def _record_death(experiment: Experiment, jobs: Jobs) -> None:
     status = Status(Outcome.FAILED, "died", "its process died (out of memory?)")
     path = jobs.folder / f"rows-{jobs.name}-{experiment.key}{store.JOURNAL}"
     with store.journal(path) as journal:
-        journal.append([failure(experiment, status)])
+        journal.append([failure_row(experiment, status)])
 
 
 @contextmanager

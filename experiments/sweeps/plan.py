@@ -25,10 +25,10 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from experiments.runs.compose import (
     Composed,
     Composer,
-    composing,
+    name_study_files,
+    open_composer,
     searched,
     set_value,
-    with_study_file,
 )
 from experiments.runs.experiment import Experiment
 from experiments.runs.key import decides_recording, files_of_options, leaf_digests
@@ -196,7 +196,7 @@ class Plan:
         )
         if name is None:
             return self
-        families = [replace(f, first=f.first.replaced(name=name)) for f in self.families]
+        families = [replace(f, first=f.first.replace(name=name)) for f in self.families]
         return replace(self, families=families)
 
     def as_json(self, runs: Numbers) -> list[Any]:
@@ -209,13 +209,15 @@ class Plan:
         ]
 
 
-def planned(arguments: Sequence[str], config_dir: str | None = None) -> Iterator[Experiment]:
+def plan_experiments(
+    arguments: Sequence[str], config_dir: str | None = None
+) -> Iterator[Experiment]:
     """Runs of all combinations, in the order of the arguments."""
-    plan = plan_of(arguments, config_dir)
+    plan = make_plan(arguments, config_dir)
     return map(plan.experiment, range(len(plan.keys)))
 
 
-def plan_of(arguments: Sequence[str], config_dir: str | None = None) -> Plan:
+def make_plan(arguments: Sequence[str], config_dir: str | None = None) -> Plan:
     """Plan all combinations of a sweep's arguments.
 
     Raises
@@ -223,17 +225,17 @@ def plan_of(arguments: Sequence[str], config_dir: str | None = None) -> Plan:
     InputError
         If an override is wrong, or a key is unknown.
     """
-    arguments = with_study_file(arguments)
+    arguments = name_study_files(arguments)
     searching = [a for a in arguments if a.lstrip("+~").startswith("hydra.")]
     arguments = [a for a in arguments if a not in searching]
-    with composing([*searched(config_dir), *searching]) as composer:
+    with open_composer([*searched(config_dir), *searching]) as composer:
         given = OverridesParser.create().parse_overrides(list(arguments))
         fixed = [o.input_line or "" for o in given if not o.is_sweep_override()]
-        study = composer.composed(fixed)
+        study = composer.compose(fixed)
         parts = []
         for part in _sweeps(study.cfg):
             lines = [f"{key}={value}" for key, value in {**study.params, **part}.items()]
-            parts.append(swept([*lines, *arguments]))
+            parts.append(parse_swept([*lines, *arguments]))
         n_runs = sum(math.prod(map(len, part.values())) for part in parts)
         require(n_runs <= _MOST_RUNS, f"{n_runs:.3g} runs: {_TOO_MANY}")
         grids = [_grid(part, composer) for part in parts]
@@ -254,7 +256,7 @@ def _sweeps(study: DictConfig) -> Sequence[Mapping[str, Any]]:
     return list(sweeps)
 
 
-def swept(lines: Sequence[str]) -> dict[str, Sequence[Any]]:
+def parse_swept(lines: Sequence[str]) -> dict[str, Sequence[Any]]:
     """The swept values by key; a later line replaces an earlier one of its key.
 
     A plain number or truth value is given as such, a range of whole numbers as a range; what else
@@ -322,7 +324,7 @@ def _grid(
         at = dict(zip(outer, places, strict=True))
         lines = [texts[key][place] for key, place in at.items()]
         found, axes = _composed(composer, lines, {key: choices[key] for key in inner})
-        first = Experiment(*found.resolved()).replaced(picture=False)
+        first = Experiment(*found.resolve()).replace(picture=False)
         made = Family(first, tuple(axes[key] for key in inner))
         cells = tuple(at.get(key, slice(None)) for key in choices)
         family[cells] = len(families)
@@ -361,7 +363,7 @@ def _composed(
     A key is an axis where all that depends on it takes its value unchanged, and where no file and
     no code is chosen by it.
     """
-    found = composer.composed(overrides)
+    found = composer.compose(overrides)
     cfg = found.cfg
     values = {
         key: each
@@ -428,7 +430,7 @@ def _sums(first: str, steps: Sequence[Digests]) -> Digests:
     return total
 
 
-def packed(recordings: Digests, n_jobs: int) -> list[Numbers]:
+def pack_jobs(recordings: Digests, n_jobs: int) -> list[Numbers]:
     """Places of runs in about `n_jobs` jobs; those of one recording stay together if they can.
 
     Parameters

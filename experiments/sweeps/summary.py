@@ -10,8 +10,15 @@ import pandas as pd
 from experiments.evaluation.statistics import holm
 from experiments.runs.columns import COLUMNS, PATH, RELATIVE
 from experiments.runs.row import GAP, Outcome
-from experiments.sweeps.averages import RECORDING, averages, difference_p, pooled, rule, unit_of
-from experiments.sweeps.collect import DRAWN, no_column, telling, with_answers
+from experiments.sweeps.averages import (
+    RECORDING,
+    averages,
+    difference_p,
+    pool_repeats,
+    rule,
+    unit_of,
+)
+from experiments.sweeps.collect import DRAWN, distinguishing_settings, no_column, with_answers
 from sim.errors import InputError, require
 
 ERROR = "answer_ate_rmse_m"
@@ -58,7 +65,7 @@ def summary(
         If a metric is not in the table, or the estimator is not.
     """
     table = with_answers(table, metrics or _MAIN)
-    by = telling(table.drop(columns=list(DRAWN), errors="ignore"))
+    by = distinguishing_settings(table.drop(columns=list(DRAWN), errors="ignore"))
     shown = list(metrics) or [c for c in _MAIN if c in table and table[c].notna().any()]
     for column in shown:
         if column not in table:
@@ -123,7 +130,7 @@ def _rows_of(estimator: str, table: pd.DataFrame) -> pd.DataFrame:
         why = f"all runs of {estimator} failed" if failed else f"no rows of estimator {estimator}"
         there = ", ".join(sorted(sound["choice.estimator"].unique()))
         raise InputError(f"{why}; there are {there or 'no others'}")
-    if own := [c for c in telling(one) if c.startswith("estimator.")]:
+    if own := [c for c in distinguishing_settings(one) if c.startswith("estimator.")]:
         print(f"{estimator} is the mean over its {', '.join(own)}", file=sys.stderr)
     return one
 
@@ -137,18 +144,18 @@ def _compare(
 ) -> None:
     """Add which means differ from the reference's, and the ratio of the position errors."""
     p: dict[tuple[int, str], float] = {}
-    own = [c for c in telling(reference) if c not in DRAWN]
+    own = [c for c in distinguishing_settings(reference) if c not in DRAWN]
     for name in names:
-        theirs = pooled(reference, [RECORDING], name, own)
-        for group, ours in pooled(table, [_GROUP, RECORDING], name).groupby(level=0):
+        theirs = pool_repeats(reference, [RECORDING], name, own)
+        for group, ours in pool_repeats(table, [_GROUP, RECORDING], name).groupby(level=0):
             p[group, name] = difference_p(ours.droplevel(0), theirs, name)
     tested = {pair: value for pair, value in p.items() if value < 1.0}  # not NaN, nor with itself
     differs = dict(zip(tested, holm(list(tested.values()), _LEVEL), strict=True))
     for name in names:
         found[f"{name}_differs"] = [differs.get((group, name), False) for group in found.index]
     if ERROR in names:
-        each = pooled(table, [_GROUP, RECORDING], ERROR)
-        theirs = pooled(reference, [RECORDING], ERROR, own)
+        each = pool_repeats(table, [_GROUP, RECORDING], ERROR)
+        theirs = pool_repeats(reference, [RECORDING], ERROR, own)
         ratio = each / each.index.get_level_values(1).map(theirs)
         table = ratio.rename(ERROR).reset_index()
         _add(found, RELATIVE + against, averages(table, [_GROUP], RECORDING, ERROR))

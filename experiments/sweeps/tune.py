@@ -30,13 +30,13 @@ from omegaconf import OmegaConf
 from experiments.evaluation.statistics import Interval, log_ratio_interval
 from experiments.runs import paths
 from experiments.runs.columns import REVISED
-from experiments.runs.compose import composed_options, option_called, searched
+from experiments.runs.compose import compose_options, find_option, searched
 from experiments.runs.console import progress
 from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
-from experiments.runs.processes import held_interrupts
+from experiments.runs.processes import hold_interrupts
 from experiments.runs.row import Outcome, Row, read_rows, write_frame
-from experiments.sweeps.plan import planned
+from experiments.sweeps.plan import plan_experiments
 from experiments.sweeps.ranges import FIRST_JUDGED_SEED, Range, Tuning
 from experiments.viewing.plotting import plain_log
 from experiments.viewing.style import SERIES, save_figure, subplots
@@ -50,7 +50,7 @@ _PRUNED_BELOW = 0.1  # p of the signed-rank test
 
 
 @dataclass(frozen=True)
-class Tuned:
+class TuningResult:
     """What came of tuning one estimator.
 
     Attributes
@@ -81,7 +81,7 @@ class Tuned:
 
 def tuning_of(study: str, config_dir: str | None = None) -> Tuning:
     """The `tune` of a study's YAML."""
-    cfg = composed_options([*searched(config_dir), f"study={study}"])
+    cfg = compose_options([*searched(config_dir), f"study={study}"])
     settings: Any = OmegaConf.to_container(cfg)
     return build(Tuning, settings.get("tune"), f"study={study}: tune")
 
@@ -93,7 +93,7 @@ def tune(
     jobs: int = 1,
     config_dir: str | None = None,
     on_progress: Callable[[float], None] = lambda _: None,
-) -> Iterator[Tuned]:
+) -> Iterator[TuningResult]:
     """Tune the estimators of a study, and judge each.
 
     Trials are kept in `results/tune/STUDY/ESTIMATOR.journal`: a run that was interrupted goes on
@@ -154,9 +154,9 @@ def tune_study(
     return "\n".join([text, *map(paths.short, written)])
 
 
-def write(tuned: Tuned, study: str, tuning: Tuning, folder: Path) -> Path:
+def write(tuned: TuningResult, study: str, tuning: Tuning, folder: Path) -> Path:
     """Write the default with the winner's values, `ESTIMATOR_tuned.yaml`; return its path."""
-    option = option_called("estimator", tuned.estimator)
+    option = find_option("estimator", tuned.estimator)
     path = folder / f"{option}_tuned.yaml"
     write_text(
         path,
@@ -171,13 +171,13 @@ def write(tuned: Tuned, study: str, tuning: Tuning, folder: Path) -> Path:
     return path
 
 
-def trials_table(results: Sequence[Tuned]) -> pd.DataFrame:
+def trials_table(results: Sequence[TuningResult]) -> pd.DataFrame:
     """All trials, a row each."""
     parts = {tuned.estimator: tuned.trials for tuned in results}
     return pd.concat(parts, names=["estimator"]).reset_index(level=0).reset_index(drop=True)
 
 
-def gains_table(results: Sequence[Tuned]) -> pd.DataFrame:
+def gains_table(results: Sequence[TuningResult]) -> pd.DataFrame:
     """A row an estimator: trials, errors of default and winner, and their ratio's interval."""
     return pd.DataFrame(
         [
@@ -256,11 +256,11 @@ def _problem(study: str, name: str, tuning: Tuning, config_dir: str | None) -> _
     common = [
         f"study={study}",
         "sweeps=[]",
-        f"estimator={option_called('estimator', name, config_dir)}",
+        f"estimator={find_option('estimator', name, config_dir)}",
     ]
     seeds = f"seed={','.join(map(str, tuning.seeds))}"
-    drives = sorted(planned([*common, seeds], config_dir), key=lambda e: e.seed)
-    judged = list(planned(common, config_dir))
+    drives = sorted(plan_experiments([*common, seeds], config_dir), key=lambda e: e.seed)
+    judged = list(plan_experiments(common, config_dir))
     require(
         all(e.seed >= FIRST_JUDGED_SEED for e in judged),
         f"study={study}: its own seeds are judged, and must be {FIRST_JUDGED_SEED} or more",
@@ -278,7 +278,7 @@ def _problem(study: str, name: str, tuning: Tuning, config_dir: str | None) -> _
     return _Problem(name, tuning.trials, ranges, drives, judged, default)
 
 
-def _tuned(problem: _Problem, journal: Path, jobs: int) -> Tuned:
+def _tuned(problem: _Problem, journal: Path, jobs: int) -> TuningResult:
     journal.parent.mkdir(parents=True, exist_ok=True)
     opened, default = _opened(journal, problem), problem.default
     if not opened.trials:
@@ -292,7 +292,7 @@ def _tuned(problem: _Problem, journal: Path, jobs: int) -> Tuned:
     before, after = (_judged(opened, chosen, problem.judged, jobs) for chosen in (default, values))
     default_m, tuned_m = (math.exp(float(np.mean(np.log(e)))) for e in (before, after))
     gain = log_ratio_interval(after, before)
-    return Tuned(problem.name, values, trials, gain, default_m, tuned_m, len(problem.judged))
+    return TuningResult(problem.name, values, trials, gain, default_m, tuned_m, len(problem.judged))
 
 
 def _judged(
@@ -344,7 +344,7 @@ def _suggested(trial: Any, name: str, allowed: Range) -> Any:
 
 def error_m(experiment: Experiment) -> float:
     """Position error of the best answer, RMS m; the geometric mean over its repeats."""
-    with held_interrupts() as on_step:  # an interrupted run is none that failed
+    with hold_interrupts() as on_step:  # an interrupted run is none that failed
         rows = evaluate(experiment, shown=lambda _: nullcontext(on_step))
     return math.exp(float(np.mean([math.log(_answer_m(row)) for row in rows])))
 

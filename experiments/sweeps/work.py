@@ -14,13 +14,13 @@ from typing import Any
 from experiments.runs import store
 from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
-from experiments.runs.processes import held_interrupts
+from experiments.runs.processes import hold_interrupts
 from experiments.runs.row import Row, Status, check_row
 from experiments.sweeps.plan import Family
 from sim.team import Team
 
 
-def share_of(plan: str | Path, job: int) -> Path:
+def share_path(plan: str | Path, job: int) -> Path:
     """File of a job's share of the plan."""
     return Path(f"{plan}.jobs") / f"share-{job}.json"
 
@@ -51,7 +51,7 @@ def end_with(node: str, planner: int) -> None:
     if platform.node() != node or os.getpid() == planner:
         return
     if os.getppid() != planner:  # started by a launcher's own processes, or left behind just now
-        if not is_there(planner):
+        if not is_alive(planner):
             os._exit(1)
         return
 
@@ -76,7 +76,7 @@ def run_and_record(experiment: Experiment, held: dict[str, Team], journal: store
         Takes the rows.
     """
     journal.begin(experiment.key)
-    with held_interrupts() as on_step:  # what one causes is not a result
+    with hold_interrupts() as on_step:  # what one causes is not a result
         try:
             rows = evaluate(
                 experiment,
@@ -86,7 +86,7 @@ def run_and_record(experiment: Experiment, held: dict[str, Team], journal: store
             for row in rows:
                 check_row(row)
         except (Exception, SystemExit) as error:
-            rows = [failure(experiment, Status.of_error(error))]
+            rows = [failure_row(experiment, Status.of_error(error))]
     journal.append(rows)
 
 
@@ -98,12 +98,12 @@ def _held(experiment: Experiment, held: dict[str, Team], on_progress: Callable[.
     return held[key]
 
 
-def failure(experiment: Experiment, status: Status) -> Row:
+def failure_row(experiment: Experiment, status: Status) -> Row:
     """Row of a run that left none itself."""
     return {**experiment.labels(""), **status.columns()}
 
 
-def is_there(process: int) -> bool:
+def is_alive(process: int) -> bool:
     """Whether a process of this machine lives."""
     try:
         os.kill(process, 0)

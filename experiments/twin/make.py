@@ -13,7 +13,7 @@ from scipy import ndimage
 from estimators.base import Prior
 from estimators.graph.graph_slam import GraphSlam
 from estimators.graph.smoother import Smoother
-from experiments.calibration.from_log import Found, calibrate_log
+from experiments.calibration.from_log import LogCalibration, calibrate_log
 from experiments.calibration.reference import names_of, spaced_rows
 from experiments.runs.calibration import Slip
 from experiments.runs.evaluate import run_over
@@ -51,12 +51,12 @@ class Twin:
     stamps, way
         (T,) s from the start of `rest`, and poses (T, 3) that the robot drives through.
     robot
-        As it is on the average of what the calibration leaves open.
+        The robot at the mean of the calibrated parameters.
     sensors, landmarks, grid
         Sensors by name; landmarks (L, 3) m; walls, or None.
     """
 
-    found: Found
+    found: LogCalibration
     rest: Recording
     stamps: Array
     way: Array
@@ -102,7 +102,7 @@ class Twin:
             np.zeros((len(self.landmarks), 0), np.float32),
         )
 
-    def simulated(self, seed: int) -> Recording:
+    def simulate(self, seed: int) -> Recording:
         """Simulate the drive by a drawn robot and sensors; believed are the calibrated ones."""
         robot, sensors = self.drawn(stream(seed, "twin"))
         streams = {axis: stream(seed, axis) for axis in ("slip", "sensors")}
@@ -118,7 +118,7 @@ class Twin:
         return math.log(found.high / found.low) / _SIGMAS if found.low > 0.0 else 0.0
 
     def _moved(self, name: str, sensor: Any, rng: np.random.Generator) -> Sensor:
-        """Return a sensor whose mount and scale are off by what is not known of them."""
+        """Return the sensor with mount and scale drawn from their uncertainty."""
 
         def off(key: str) -> float:
             found = self.found.intervals.get(f"sensors.{name}.{key}")
@@ -147,11 +147,11 @@ def make_twin(log: Recording, split_s: float | None = None) -> Twin:
     InputError
         If the log has too little to be calibrated, or no laser and no camera of landmarks.
     """
-    name, sensor = observer(log)
+    name, sensor = find_observer(log)
     split_s = log.duration_s / 2.0 if split_s is None else split_s
     found = calibrate_log(log, split_s)
     calibration = found.calibration
-    right = calibration.applied(log)
+    right = calibration.apply(log)
     known, poses = best_poses(right, calibration.slip)
     stamps, way = way_of(right, known, poses)
     begin = _first_frame(right, stamps, log.frame_stamps[0] + split_s)
@@ -207,7 +207,7 @@ def _first_frame(recording: Recording, stamps: Array, split: float) -> float:
 
 
 def _cleared(grid: OccupancyGrid, way: Array, robot: DifferentialDrive) -> OccupancyGrid:
-    """Return the grid without what stands where the robot drove: it has since gone."""
+    """Clear the grid's cells where the robot drove: what was there has moved."""
     half = [
         max(robot.body_length_m / 2.0, robot.wheel_radius_m),
         max(robot.body_width_m, robot.track_m) / 2.0,
@@ -229,7 +229,7 @@ _KNOTS_S = 1.0  # between poses of a dense truth, whose noise would be taken for
 _START = np.diag([1e-6] * 3)
 
 
-def observer(recording: Recording) -> tuple[str, Laser | StereoCamera]:
+def find_observer(recording: Recording) -> tuple[str, Laser | StereoCamera]:
     """Name and sensor of the first laser or camera of landmarks.
 
     Raises
@@ -253,7 +253,7 @@ def best_poses(recording: Recording, slip: Slip) -> tuple[Array, Array]:
     """
     if recording.truth is not None:
         return recording.truth.stamps, recording.truth.poses
-    name, sensor = observer(recording)
+    name, sensor = find_observer(recording)
     batch: GraphSlam | Smoother = (
         GraphSlam(kr=slip.kr, kl=slip.kl, laser=name)
         if isinstance(sensor, Laser)

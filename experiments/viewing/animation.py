@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from experiments.evaluation.metrics import CHI2_95_2DOF
 from experiments.viewing.grid import draw_grid
-from experiments.viewing.playback import Playback, Shown, last_row
+from experiments.viewing.playback import Playback, RobotTrack, last_row
 from experiments.viewing.plotting import literal, plan_axes
 from experiments.viewing.style import (
     BLACK,
@@ -113,7 +113,7 @@ def _layers(run: Playback) -> dict[str, Layer]:
     return layers
 
 
-def _layers_alone(own: Shown, name: str) -> dict[str, Layer]:
+def _layers_alone(own: RobotTrack, name: str) -> dict[str, Layer]:
     """What moves of a robot alone: its sensors' readings, particles and landmarks too."""
     extras = {} if own.estimate is None else own.estimate.extras
     particles, mapped = (
@@ -157,7 +157,7 @@ def _instants(run: Playback, around: Bounds) -> Iterator[tuple[Points, str]]:
                 found["robot"] = robot_outline(own.truth_at(np.array([at]))[0], glyph_m)
             found |= _believed(own, at, glyph_m)
             if len(run.robots) == 1:
-                found |= {name: seen_points(own, name, at) for name in drawable(own.recording)}
+                found |= {name: sensor_points(own, name, at) for name in drawable(own.recording)}
             now = (when <= stamp + 1e-9) & (when > stamp - _SEEN_S)
             gaps = np.full((int(now.sum()), 1, 2), np.nan)
             found["seen"] = np.concatenate([lines[now], gaps], axis=1).reshape(-1, 2)
@@ -174,7 +174,7 @@ def _error_words(run: Playback, stamp: float) -> str:
     return f", position error {np.hypot(*off[:2]):.3f} m" if np.isfinite(off).all() else ""
 
 
-def _believed(own: Shown, stamp: float, glyph_m: float) -> Points:
+def _believed(own: RobotTrack, stamp: float, glyph_m: float) -> Points:
     """Points of what is believed of a robot."""
     row = own.belief_row(stamp)
     if own.estimate is None or row < 0:
@@ -196,7 +196,7 @@ def _believed(own: Shown, stamp: float, glyph_m: float) -> Points:
     return points
 
 
-def seen_points(own: Shown, name: str, stamp: float) -> Array:
+def sensor_points(own: RobotTrack, name: str, stamp: float) -> Array:
     """Points (N, 2) in map of a sensor's last reading up to a time."""
     stamps = own.recording.logs[name].stamps
     row = last_row(stamps, stamp)
@@ -206,9 +206,9 @@ def seen_points(own: Shown, name: str, stamp: float) -> Array:
     return se2.transform(pose, points_in_base(own.recording, name, row))
 
 
-def seen(own: Shown, stamp: float) -> Array:
+def all_sensor_points(own: RobotTrack, stamp: float) -> Array:
     """Points (N, 2) in map of all sensors' last readings up to a time."""
-    shown = (seen_points(own, name, stamp) for name in drawable(own.recording))
+    shown = (sensor_points(own, name, stamp) for name in drawable(own.recording))
     return np.concatenate([_NONE, *shown])
 
 
@@ -246,7 +246,7 @@ def bounds(run: Playback) -> Bounds:
     return x1, y1, x2, y2
 
 
-def _bounds(own: Shown, run: Playback) -> tuple[Array, Array]:
+def _bounds(own: RobotTrack, run: Playback) -> tuple[Array, Array]:
     """Lower left and upper right corner, (2,) m."""
     world = own.recording.world
     known = np.concatenate(

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from estimators.base import Estimate
 from experiments.evaluation.metrics import heading_errors_rad, position_errors_m
-from experiments.runs.score import Scored, Scoring, error_table, scored_against
+from experiments.runs.score import ScoredTrajectory, Scoring, error_table, match_and_align
 from experiments.trajectories.read import read_trajectory
 from experiments.viewing.plotting import plan_axes
 from experiments.viewing.style import CYCLE, TRUTH, figure, save_figure
@@ -41,20 +41,20 @@ def compare_files(
     if log is not None:
         recording = read_any([log])
     else:
-        require(len(given) >= 2, "one trajectory alone: add others, or a recording with the truth")
+        require(len(given) >= 2, "only one trajectory: add another, or a recording with truth")
         reference = next(iter(given))
         recording = reference_of(given.pop(reference))
     found, paths = {}, dict(zip(short, trajectories, strict=True))
     for name, estimate in given.items():
         try:
-            found[name] = scored_against(recording, estimate, how)
+            found[name] = match_and_align(recording, estimate, how)
         except InputError as error:
             raise InputError(f"{paths[name]}: {error}") from error
     save_figure(compare_figure(recording, found, reference), out)
     return compare_table(found)
 
 
-def compare_table(found: Mapping[str, Scored]) -> pd.DataFrame:
+def compare_table(found: Mapping[str, ScoredTrajectory]) -> pd.DataFrame:
     """Root mean squares of all errors, greatest position error, and what was scored."""
     rows = []
     for name, scored in found.items():
@@ -72,7 +72,9 @@ def compare_table(found: Mapping[str, Scored]) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def compare_figure(recording: Recording, found: Mapping[str, Scored], reference: str) -> Figure:
+def compare_figure(
+    recording: Recording, found: Mapping[str, ScoredTrajectory], reference: str
+) -> Figure:
     """Paths in the plane on the left; errors of position and heading over time on the right.
 
     Parameters

@@ -39,10 +39,10 @@ def with_estimates(
     """
     team, path = Team(tuple(own.recording for own in shown.robots)), Path(source)
     if _is_file(path, overrides):
-        return shown.believing(_read_all(team, path), "estimate")
+        return shown.with_estimates(_read_all(team, path), "estimate")
     experiment = experiment_over(team.robots[0], source, overrides)
     if len(team) == 1:
-        return shown.believing([_sparing(experiment, shown, on_step)], source)
+        return shown.with_estimates([_sparing(experiment, shown, on_step)], source)
     found = run_team(
         experiment.team_estimator,
         team,
@@ -50,7 +50,7 @@ def with_estimates(
         lambda robot: stream(experiment.seed, f"estimator/{source}", robot),
         on_step=on_step,
     )
-    return shown.believing([revised or online for online, revised in found], source)
+    return shown.with_estimates([revised or online for online, revised in found], source)
 
 
 def with_estimates_by(
@@ -62,7 +62,7 @@ def with_estimates_by(
     else:
         team = Team(tuple(own.recording for own in shown.robots))
         found = [online for online, _ in run_robots(experiment, team, repeat, on_step)]
-    return shown.believing(found, experiment.estimator_name)
+    return shown.with_estimates(found, experiment.estimator_name)
 
 
 def _sparing(experiment: Experiment, shown: Playback, on_step: OnStep, repeat: int = 0) -> Estimate:
@@ -121,7 +121,7 @@ def read_estimate(recording: Recording, path: Path) -> Estimate:
     if path.is_dir():
         require(
             not (path / "estimate_0.csv").exists(),
-            f"{path}: the run of a team; its robots' estimates are {path}/estimate_0.csv and on",
+            f"{path}: a team's run; its estimates are {path}/estimate_0.csv and so on",
         )
         path /= "estimate.csv"
     stamps = recording.frame_stamps

@@ -44,11 +44,11 @@ def grid_figure(grid: OccupancyGrid, title: str) -> Figure:
     ax = page.subplots()
     draw_grid(ax, grid)
     ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), facecolor=UNKNOWN)
-    ax.set_title(f"{title}: {described(grid)}", loc="left", fontsize="medium")
+    ax.set_title(f"{title}: {describe_grid(grid)}", loc="left", fontsize="medium")
     return page
 
 
-def described(grid: OccupancyGrid) -> str:
+def describe_grid(grid: OccupancyGrid) -> str:
     """Size of a grid, and the shares of its cells, in words."""
     rows, columns = grid.probability.shape
     free, occupied = float(grid.free.mean()), float(grid.occupied.mean())

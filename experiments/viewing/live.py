@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from experiments.viewing.animation import bounds, seen
+from experiments.viewing.animation import all_sensor_points, bounds
 from experiments.viewing.playback import Playback
 from sim.arrays import Array
 from sim.errors import require
@@ -30,7 +30,7 @@ _BLACK, _BLUE, _RED = (0.1, 0.1, 0.1), (0.0, 0.45, 0.7), (0.84, 0.37, 0.0)
 
 
 def check_display() -> None:
-    """Refuse to open a window where there is nothing to show it on."""
+    """Raise InputError if there is no display for a window."""
     require(
         not sys.platform.startswith("linux") or os.environ.get("DISPLAY"),
         f"no display for a window (DISPLAY is not set); {_REMEDY}",
@@ -114,7 +114,9 @@ def _play(engine: Any, run: Playback, seconds: float | None) -> None:
             if i % _TRAIL_EVERY == 0:
                 engine.addUserDebugLine([*before[:2], 0.02], [*pose[:2], 0.02], colours[name], 2)
                 trails[name] = pose
-        points = seen(own, float(stamp))[::3] if i % _SCAN_EVERY == 0 else np.zeros((0, 2))
+        points = (
+            all_sensor_points(own, float(stamp))[::3] if i % _SCAN_EVERY == 0 else np.zeros((0, 2))
+        )
         if len(points):
             raised = np.column_stack([points, np.full(len(points), 0.2)]).tolist()
             scan = engine.addUserDebugPoints(raised, [_RED] * len(points), 3, **replaced)

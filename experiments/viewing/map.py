@@ -11,7 +11,7 @@ import numpy as np
 from experiments.evaluation.time_sync import interpolate
 from experiments.runs.console import progress
 from experiments.viewing.estimates import check_no_overrides, estimate_along
-from experiments.viewing.grid import described
+from experiments.viewing.grid import describe_grid
 from sim.arrays import Array
 from sim.errors import require, required
 from sim.formats.detect import read_any
@@ -95,7 +95,7 @@ def map_file(log: str, source: str, overrides: Sequence[str], out: Path, how: Gr
             on_progress=on_progress,
         )
     write_grid(grid, out, "raw" if how.raw else "trinary")
-    return f"{out}: {described(grid)}, from {n_scans} of {n_all} scans"
+    return f"{out}: {describe_grid(grid)}, from {n_scans} of {n_all} scans"
 
 
 def grid_along(

@@ -24,7 +24,7 @@ def note_panels(png: Path, page: Figure, scale: float) -> None:
         png.write_bytes(data[:_HEADER] + sealed + data[_HEADER:])
 
 
-def noted_panels(image: Image.Image) -> str:
+def read_panels(image: Image.Image) -> str:
     """Panels of a picture as `panels` wrote them; empty if it has none."""
     text = image.info.get(_KEY, "")
     return text if isinstance(text, str) else ""

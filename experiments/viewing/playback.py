@@ -15,7 +15,7 @@ FPS = 10
 
 
 @dataclass(frozen=True)
-class Shown:
+class RobotTrack:
     """A robot's recording, and beliefs or None; they have extras at the shown Frames."""
 
     recording: Recording
@@ -56,7 +56,7 @@ class Playback:
         How long it plays, s; None: in real time.
     """
 
-    robots: tuple[Shown, ...]
+    robots: tuple[RobotTrack, ...]
     stamps: Array
     name: str = "estimate"
     grid: OccupancyGrid | None = None
@@ -74,7 +74,7 @@ class Playback:
         if len(frames) == 1:
             rows = np.clip(np.searchsorted(frames[0], stamps), 0, len(frames[0]) - 1)
             stamps = frames[0][np.unique(rows)]
-        return cls(tuple(map(Shown, team.robots)), stamps)
+        return cls(tuple(map(RobotTrack, team.robots)), stamps)
 
     @property
     def rows(self) -> Ints:
@@ -87,7 +87,7 @@ class Playback:
         """Pictures a second."""
         return len(self.stamps) / (self.seconds or max(float(np.ptp(self.stamps)), 1.0 / FPS))
 
-    def believing(self, estimates: Sequence[Estimate], name: str) -> "Playback":
+    def with_estimates(self, estimates: Sequence[Estimate], name: str) -> "Playback":
         """Show an estimate of each robot too."""
         robots = zip(self.robots, estimates, strict=True)
         shown = (replace(own, estimate=estimate) for own, estimate in robots)

@@ -137,16 +137,16 @@ def wheels_from_velocities(
     )
 
 
-def chained(steps: Array) -> Array:
+def chain_motions(steps: Array) -> Array:
     """Poses (N + 1, 3) from the origin on by relative motions (N, 3); headings wrapped."""
     poses = se2.chain(steps)
     poses[:, 2] = se2.wrap(poses[:, 2])
     return poses
 
 
-def rolled(wheels: WheelLog, track_m: float) -> Array:
+def pose_by_wheels(wheels: WheelLog, track_m: float) -> Array:
     """Poses (N, 3) from the origin on by the wheels' travel; headings wrapped."""
-    return chained(arc_increment(np.diff(wheels.position_m, axis=0), track_m))
+    return chain_motions(arc_increment(np.diff(wheels.position_m, axis=0), track_m))
 
 
 def rate_hz(stamps: Array) -> float:

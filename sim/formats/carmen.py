@@ -171,7 +171,7 @@ def to_recording(
         edges = log.edges if len(log.edges) else np.zeros((len(log.scan_stamps) - 1, 3))
         if missing := int(np.sum(~np.isfinite(edges).all(axis=1))):
             notes["edges_missing"] = missing
-        chain = assemble.chained(np.nan_to_num(edges))
+        chain = assemble.chain_motions(np.nan_to_num(edges))
         wheels = assemble.wheels_from_poses(log.scan_stamps.copy(), chain, track_m, notes)
         notes["wheels_from"] = "edges of the graph" if len(log.edges) else "nothing"
         truth = Truth(log.scan_stamps.copy(), log.scan_poses.copy())
@@ -244,7 +244,7 @@ def write_carmen(path: Path, recording: Recording) -> None:
         f"{path}: a CARMEN log needs a laser, and this recording has none",
     )
     laser, log = recording.sensor("laser", Laser), recording.log("laser")
-    poses = assemble.rolled(recording.wheels, recording.robot.track_m)
+    poses = assemble.pose_by_wheels(recording.wheels, recording.robot.track_m)
     heading = np.unwrap(poses[:, 2])
     lines = [
         f"ODOM {x:.17g} {y:.17g} {a:.17g} 0 0 0 {t:.17g} estima {t:.17g}"

@@ -148,7 +148,7 @@ def read_thinned_intel(
     stamps[: rows[0]] = clock[0] - (busy_s[rows[0]] - busy_s[: rows[0]])
     stamps[rows[-1] :] = clock[-1] + (busy_s[rows[-1] :] - busy_s[rows[-1]])
     notes: assemble.Notes = {"matches_left_out": len(numbers) - len(known)}
-    wheels = assemble.wheels_from_poses(stamps, assemble.chained(steps), track_m, notes)
+    wheels = assemble.wheels_from_poses(stamps, assemble.chain_motions(steps), track_m, notes)
     recording = assemble.scan_recording(
         wheels,
         stamps,

@@ -14,7 +14,7 @@ import numpy as np
 from sim import se2
 from sim.arrays import Array
 from sim.errors import InputError, require
-from sim.formats.assemble import chained
+from sim.formats.assemble import chain_motions
 from sim.formats.text import json_number, read_bytes, read_members, reason_of
 from sim.recording import Recording, Truth, WheelLog
 from sim.robot.drive import RobotGeometry
@@ -116,7 +116,7 @@ def to_recording(
     steps = log.rolled_rad * np.array(wheel_diameters_m) / 2.0
     travel = np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
     laser = np.broadcast_to(np.array(T_base_laser), log.laser_motion.shape)
-    poses = chained(se2.compose(laser, se2.compose(log.laser_motion, se2.inverse(laser))))
+    poses = chain_motions(se2.compose(laser, se2.compose(log.laser_motion, se2.inverse(laser))))
     return Recording(
         frame_stamps=stamps,
         wheels=WheelLog(stamps.copy(), travel),

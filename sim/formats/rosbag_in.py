@@ -29,7 +29,7 @@ from sim.formats.rosbag_topics import (
     stamps_of,
     tf_odometry,
 )
-from sim.recording import CommandLog, Log, Recording, Truth, WheelLog, joined
+from sim.recording import CommandLog, Log, Recording, Truth, WheelLog, log_of_readings
 from sim.robot.drive import RobotGeometry
 from sim.sensors import (
     Encoder,
@@ -39,7 +39,7 @@ from sim.sensors import (
     StereoCamera,
     point_cloud,
 )
-from sim.sensors.base import parted
+from sim.sensors.base import split_schema
 from sim.worlds.world import World
 
 NOMINAL_TRACK_M, NOMINAL_RADIUS_M = 0.3, 0.1  # of a robot that the bag does not describe
@@ -174,7 +174,7 @@ def _sensor_log(
 ) -> tuple[Log, dict[str, Values]]:
     """Log of a sensor of ours, and what its schema marks as truth."""
     sensor, topic = about["sensors"][name], topics.get(about["topics"][name], Topic("", [], []))
-    seen, hidden = parted(about["schemas"][name])
+    seen, hidden = split_schema(about["schemas"][name])
     if hasattr(sensor, "ros_message"):
         readings = [sensor.from_ros(message) for message in topic.messages]
         # in version 0.1 true ids lay among the observations, and ids were there if observed
@@ -186,8 +186,8 @@ def _sensor_log(
         messages = topics[f"/ground_truth/sensors/{name}"].messages
         true = [own_reading(hidden, message) for message in messages]
     hidden = {key: field for key, field in hidden.items() if all(key in r for r in true)}
-    log = joined(seen, stamps_of(topic), readings, name)
-    return log, {key: field.joined([r[key] for r in true], key) for key, field in hidden.items()}
+    log = log_of_readings(seen, stamps_of(topic), readings, name)
+    return log, {key: field.stack([r[key] for r in true], key) for key, field in hidden.items()}
 
 
 def _chosen(

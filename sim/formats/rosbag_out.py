@@ -16,7 +16,7 @@ import numpy as np
 from sim import se2
 from sim.arrays import Array
 from sim.errors import InputError
-from sim.formats.assemble import rolled
+from sim.formats.assemble import pose_by_wheels
 from sim.formats.rosbag import (
     ABOUT,
     CLOUD,
@@ -37,7 +37,7 @@ from sim.formats.rosbag import (
     topics_of,
     typestore,
 )
-from sim.recording import Log, Recording, Truth, described
+from sim.recording import Log, Recording, Truth, describe
 from sim.robot.slip import twist_covariances
 from sim.sensors import Mount, point_cloud
 from sim.sensors.base import is_ours
@@ -254,14 +254,14 @@ def _write_recording(bag: _Bag, recording: Recording, slip: tuple[float, float] 
     # by their schema
     topics = {n: t if is_ours(logged[n]) else f"/sensors/{n}" for n, t in usual.items()}
     about = {
-        **described(recording),
+        **describe(recording),
         "topics": topics,
         "frame_stamps_ns": [nanoseconds(s) for s in recording.frame_stamps],
     }
     bag.write(ABOUT, STRING, first, data=json.dumps(about))
     _write_mounts(bag, recording, first)
     track_m = recording.robot.track_m
-    poses, unknown = rolled(wheels, track_m), np.zeros((len(wheels.stamps), 3, 3))
+    poses, unknown = pose_by_wheels(wheels, track_m), np.zeros((len(wheels.stamps), 3, 3))
     twists = None
     if slip is not None:
         lapse = np.diff(wheels.stamps, prepend=wheels.stamps[:1])

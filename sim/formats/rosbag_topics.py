@@ -30,7 +30,7 @@ from sim.formats.rosbag import (
 from sim.formats.rosbag_bounds import check_bounds
 from sim.options import build
 from sim.robot.base import RobotGeometry
-from sim.sensors.base import parted, schema_from_meta, sensors_from_meta
+from sim.sensors.base import schema_from_meta, sensors_from_meta, split_schema
 
 _BASES = ("base_link", "base_footprint", "base")
 _MOST_MESSAGES = 20_000_000
@@ -217,7 +217,7 @@ def _kinds(about: dict[str, Any], store: Any) -> set[str]:
     """Message types of the sensors' topics; those of our own are registered."""
     kinds = set()
     for name, schema in about.get("schemas", {}).items():
-        seen, hidden = parted(schema)
+        seen, hidden = split_schema(schema)
         if hasattr(about["sensors"][name], "ros_message"):
             kinds.add(about["sensors"][name].ros_message)
         else:

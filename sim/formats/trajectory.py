@@ -34,7 +34,7 @@ def read_track(path: Path, topic: str | None = None) -> Track:
     """
     require(
         not path.is_dir() or (path / "metadata.yaml").exists(),
-        f"{path}: is a folder, and not that of a ROS 2 bag; name a file",
+        f"{path}: is a folder, but not a ROS 2 bag; give a file",
     )
     if path.is_dir() or path.suffix in _BAGS or read_head(path).startswith(_MAGIC):
         track = _of_bag(path, topic)

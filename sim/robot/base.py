@@ -1,4 +1,4 @@
-"""What the simulator asks of a robot; one of another kind is a class like `sim.robot.drive`'s."""
+"""The interface of a robot; implement it for another kind of robot, as `sim.robot.drive` does."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -19,7 +19,7 @@ _DEFAULT = "sim.robot.drive.DifferentialDrive"
 
 @dataclass(frozen=True)
 class RobotGeometry:
-    """What is believed of the robot: the wheel radius and the track, m."""
+    """Assumed geometry of the robot: wheel radius and track, m."""
 
     wheel_radius_m: float
     track_m: float

@@ -1,4 +1,4 @@
-"""The law of slip: how encoders read something else than the wheels roll on the ground.
+"""The slip law: how encoder readings differ from the wheels' travel on the ground.
 
 `kr` and `kl` are variances per metre: Var(encoder - ground) = k |ds| (puzzlebot2024, eq. (5);
 decristoforis2020, eq. (2)), so their unit is the metre. The simulator, the batches of

@@ -15,7 +15,7 @@ from sim.errors import blaming, require, required
 from sim.recording import Frame
 from sim.robot.arc import arc_increment
 from sim.robot.base import Robot, RobotGeometry
-from sim.sensors.base import Reading, Schema, Sensors, parted
+from sim.sensors.base import Reading, Schema, Sensors, split_schema
 from sim.worlds.world import World
 
 CONTROL_TICKS = 6  # between two decisions of a controller: 50 Hz
@@ -83,7 +83,7 @@ class OdometryFeedback:
         return self._pose
 
     def see(self, stamp: float, encoder_m: Array, readings: Mapping[str, Reading]) -> None:
-        """Look at nothing but the encoders."""
+        """Ignore the readings: only the encoders are used."""
 
 
 class EstimatorFeedback:
@@ -171,5 +171,7 @@ def feedback_of(
     if wanted == "odometry":
         return OdometryFeedback(robot, start)
     onboard = required(onboard, "route.feedback names an estimator, but none was started")
-    schemas = {name: parted(sensor.schema)[0] for name, sensor in sensors.items() if sensor.schema}
+    schemas = {
+        name: split_schema(sensor.schema)[0] for name, sensor in sensors.items() if sensor.schema
+    }
     return EstimatorFeedback(robot, start, onboard(world, robot.nominal, sensors, start), schemas)

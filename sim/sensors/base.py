@@ -75,7 +75,7 @@ class Field:
         require(sizes, f"a field's shape must be a tuple of sizes and None, got {self.shape!r}")
         require(isinstance(self.unit, str), f"a field's unit must be a text, got {self.unit!r}")
 
-    def taken(self, value: Any, where: str) -> Values:
+    def converted_copy(self, value: Any, where: str) -> Values:
         """Read-only copy of a reading's value, of the field's type.
 
         Raises
@@ -116,7 +116,7 @@ class Field:
             f"{where} must be {self.dtype}, got {values.dtype}",
         )
 
-    def joined(self, values: Sequence[Any], where: str) -> Values:
+    def stack(self, values: Sequence[Any], where: str) -> Values:
         """Array of many readings: (N, *shape), or all rows of a ragged field, (K, *shape).
 
         Raises
@@ -138,7 +138,7 @@ class Field:
 Schema = Mapping[str, Field]
 
 
-def parted(schema: Schema) -> tuple[Schema, Schema]:
+def split_schema(schema: Schema) -> tuple[Schema, Schema]:
     """Fields that Frames show, and those that are truth."""
     seen = {name: field for name, field in schema.items() if not field.truth}
     return seen, {name: field for name, field in schema.items() if field.truth}
@@ -416,9 +416,9 @@ def _check_fields(schema: Schema, where: str) -> None:
             and name not in ("stamps", "splits", "header"),
             f"{where}: {name!r} cannot be the name of a field",
         )
-    seen, hidden = parted(schema)
+    seen, hidden = split_schema(schema)
     ragged = [any(field.ragged for field in part.values()) for part in (seen, hidden)]
     require(
         ragged != [False, True],
-        f"{where}: a ragged field of the truth needs one beside it that is seen",
+        f"{where}: a ragged truth field needs a measured ragged field too",
     )

@@ -18,7 +18,7 @@ from sim.sensors.base import Reading, Sensor, Sensors, View
 _SHARE_NOISE = ("laser", "stereo", "lidar3d")
 
 
-def ordered(sensors: Sensors) -> dict[str, Sensor]:
+def in_noise_order(sensors: Sensors) -> dict[str, Sensor]:
     """The sensors that share their noise, in its order, and then the others."""
     names = [name for name in _SHARE_NOISE if name in sensors]
     return {name: sensors[name] for name in dict.fromkeys([*names, *sensors])}
@@ -33,7 +33,7 @@ def periods(sensors: Sensors) -> dict[str, int]:
         If a rate does not divide the simulation's, or no sensor fires.
     """
     found = {}
-    for name, sensor in ordered(sensors).items():
+    for name, sensor in in_noise_order(sensors).items():
         rate = sensor.rate_hz
         if rate is None:
             continue
@@ -58,7 +58,7 @@ def probes(
 ) -> dict[str, Firing]:
     """Every sensor at work, from its first view on; `others` gives the poses of other robots."""
     found = {}
-    for name, sensor in ordered(sensors).items():
+    for name, sensor in in_noise_order(sensors).items():
         own = rng if name in _SHARE_NOISE else _stream_of(rng, name)
         found[name] = Firing(name, sensor, own, first, others)
     return found
@@ -104,6 +104,6 @@ class Firing:
                 f"got {reading!r:.60}"
             )
         return {
-            key: field.taken(reading[key], f"{self._where}.{key}")
+            key: field.converted_copy(reading[key], f"{self._where}.{key}")
             for key, field in self._schema.items()
         }

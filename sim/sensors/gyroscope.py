@@ -28,7 +28,7 @@ class Gyroscope:
 
     @property
     def schema(self) -> Schema:
-        """Yaw rate, counter-clockwise; the true bias beside it."""
+        """Yaw rate, counter-clockwise, and the true bias."""
         return {
             "yaw_rate_radps": Field("rad/s"),
             "bias_radps": Field("rad/s", truth=True),

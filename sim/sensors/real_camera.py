@@ -13,7 +13,7 @@ from sim.worlds.world import World
 
 @options("sensors.stereo")
 class RealCamera(StereoCamera):
-    """A camera that errs in depth and bearing. What is believed of it are the noises in pixels."""
+    """A camera that errs in depth and bearing. Estimators assume its noise in pixels."""
 
     scale: Positive = 1.0
     """Mean of the observed depth over the true one."""

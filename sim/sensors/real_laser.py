@@ -1,4 +1,4 @@
-"""A laser with what real ones show beside noise: short readings, none at all, and scans dropped."""
+"""A laser with the faults of real ones: short readings, missing readings and dropped scans."""
 
 from typing import Annotated
 
@@ -37,7 +37,7 @@ class RealLaser(Laser):
         require(increasing, "sensors.laser.stamps must be numbers of seconds that increase")
 
     def start(self, rng: np.random.Generator) -> Probe:
-        """Probe that casts the beams, and spoils some."""
+        """Probe that casts the beams and corrupts some of them."""
         due = iter(self.stamps or ())
         next_s = next(due, np.inf) if self.stamps is not None else -np.inf
 

@@ -115,16 +115,16 @@ def check_size(rows: float, columns: float, what: str, remedy: str) -> None:
     """Refuse a grid of too many cells before memory is taken for it."""
     require(
         rows * columns <= MOST_CELLS,
-        f"{what}: {columns:.0f} x {rows:.0f} cells, and {MOST_CELLS} are the most; {remedy}",
+        f"{what}: {columns:.0f} x {rows:.0f} cells; at most {MOST_CELLS} allowed; {remedy}",
     )
 
 
 def of_world(recording: Recording, resolution_m: float, z_m: float) -> OccupancyGrid:
     """Grid of the walls of a recording's world, for `prior.map`; see `rasterized`."""
-    return rasterized(recording.known_world, resolution_m, z_m)
+    return rasterize(recording.known_world, resolution_m, z_m)
 
 
-def rasterized(world: World, resolution_m: float, z_m: float) -> OccupancyGrid:
+def rasterize(world: World, resolution_m: float, z_m: float) -> OccupancyGrid:
     """Grid of a world's walls at a height z_m, with a margin of two cells.
 
     Occupied is every cell within a quarter of a cell of a wall: a wall near a border takes the

@@ -4,7 +4,7 @@ import pytest
 
 from experiments.runs import cache, processes
 from experiments.runs.compose import CommandLine, check_hydra, searched
-from experiments.runs.console import end
+from experiments.runs.console import exit_with
 from experiments.runs.experiment import Experiment
 from sim.errors import InputError
 
@@ -17,7 +17,7 @@ def test_an_option_that_includes_itself_is_one_line(tmp_path, capsys, options):
     with pytest.raises(RecursionError) as raised:
         Experiment.compose([*searched(tmp_path), "estimator=e"])
     with pytest.raises(SystemExit, match="2"):
-        end(raised.value)
+        exit_with(raised.value)
     assert capsys.readouterr().err.count("\n") == 1
 
 
@@ -28,7 +28,7 @@ def test_another_endless_recursion_is_an_internal_error(capsys):
     with pytest.raises(RecursionError) as raised:
         descend()
     with pytest.raises(SystemExit, match="3"):
-        end(raised.value)
+        exit_with(raised.value)
     assert "Traceback" in capsys.readouterr().err
 
 

@@ -15,7 +15,7 @@ from experiments.papers.maximo2024.settings import GRID_B, METHODS, QUALITIES
 from experiments.papers.puzzlebot2024 import study as puzzlebot2024
 from experiments.runs.experiment import Experiment
 from experiments.studies.real_logs.settings import FUSION, INTEL
-from experiments.sweeps.plan import planned
+from experiments.sweeps.plan import plan_experiments
 
 STEREO = {"sensors.stereo.correlated", "sensors.stereo.sigma_column_px"} | {
     "sensors.stereo.sigma_row_px"
@@ -40,7 +40,7 @@ def differing(experiments):
 
 
 def of_one_seed(name):
-    return [run for run in planned([f"study={name}", "seed=1000"]) if run.seed == 1000]
+    return [run for run in plan_experiments([f"study={name}", "seed=1000"]) if run.seed == 1000]
 
 
 @pytest.mark.parametrize(
@@ -74,7 +74,7 @@ def test_runs_of_gil2008_differ_in_what_their_table_compares(table, compared):
 def test_comparisons_of_distance_are_within_a_recording():
     """The draws of 3 m, 10 m and 20 m are the same, and so are their worlds."""
     drawn = {}
-    for run in planned(["study=gil2008/distance", "seed=range(1000,1002)"]):
+    for run in plan_experiments(["study=gil2008/distance", "seed=range(1000,1002)"]):
         if run.estimator_name == "fastslam_paper":
             camera = run.config["sensors"]["stereo"]
             kind = (camera["max_observations"], camera["selection"])
@@ -213,7 +213,7 @@ def test_planes_and_points_have_the_same_stages_and_end(monkeypatch):
 
 
 def test_intels_fusion_and_its_rivals_read_the_same_log():
-    runs = dict(zip(INTEL, planned(["study=real_logs/intel"]), strict=True))
+    runs = dict(zip(INTEL, plan_experiments(["study=real_logs/intel"]), strict=True))
     rivals = [runs[name] for name in ("ICP alone", "ICP from the wheels", FUSION)]
     assert differing(rivals) <= {"recording.version", "method"}
     wheels = [runs[name].recording_key for name in ("ICP from the wheels", FUSION)]
@@ -287,7 +287,7 @@ def assert_alike(calls, *compared):
 
 
 def test_weightings_of_maximo2024_differ_in_nothing_else(asked):
-    worlds.weighting_rows(worlds.case_of("umh", 5), 1)
+    worlds.weighting_rows(worlds.make_case("umh", 5), 1)
     assert_alike(asked, "weighting")
     assert [settings["weighting"] for settings, *_ in asked] == ["M1", "M2", "M3"]
 
@@ -301,7 +301,7 @@ def test_every_cell_of_the_map_compares_the_same_runs(asked):
 
 
 def test_numbers_of_particles_are_compared_over_the_same_queries(asked):
-    case = worlds.case_of("umh", 5)
+    case = worlds.make_case("umh", 5)
     list(worlds.particle_rows(case, 1))
     same_draws = [(settings, 0.0, *rest) for settings, _, *rest in asked]  # as many as particles
     assert_alike(same_draws, "particles_per_node")
@@ -309,7 +309,7 @@ def test_numbers_of_particles_are_compared_over_the_same_queries(asked):
 
 
 def test_kidnappings_with_and_without_injection_are_the_same(asked):
-    case = worlds.case_of("umh", 5)
+    case = worlds.make_case("umh", 5)
     list(worlds.kidnapping_rows(case, worlds.options(case), 0.05, 3, 30))
     assert len(asked) == 6
     for without, injected in zip(asked[::2], asked[1::2], strict=True):
@@ -318,7 +318,7 @@ def test_kidnappings_with_and_without_injection_are_the_same(asked):
 
 def test_methods_on_a_robot_of_mrclam_read_the_same_log():
     by_robot = {}
-    for run in planned(["study=real_logs/mrclam"]):
+    for run in plan_experiments(["study=real_logs/mrclam"]):
         by_robot.setdefault(run.config["recording"]["robot"], []).append(run)
     for runs in by_robot.values():
         rivals = [run for run in runs if run.config["recording"]["calibrated"]]

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import yaml
 
-from experiments.runs.compose import option_called, searched
+from experiments.runs.compose import find_option, searched
 from experiments.runs.experiment import Experiment
 from experiments.runs.paths import option_names
 from experiments.runs.schema import describe_option
 from experiments.runs.targets import make
-from experiments.sweeps.plan import planned
+from experiments.sweeps.plan import plan_experiments
 from sim.errors import InputError
 from sim.robot.drive import RobotGeometry
 from sim.sensors import sensors_from_config
@@ -110,7 +110,10 @@ def test_what_a_file_does_not_state_is_the_default_of_what_it_names(tmp_path):
     found = Experiment.compose([*own, "estimator.d0=3.0"]).options_of("estimator")
     whole = Experiment.compose(["estimator=ekf_slam"]).options_of("estimator")
     assert found == {**whole, "d0": 3.0, "kl": 3.0}
-    swept = [run.options_of("estimator")["d0"] for run in planned([*own, "estimator.d0=1.0,2.0"])]
+    swept = [
+        run.options_of("estimator")["d0"]
+        for run in plan_experiments([*own, "estimator.d0=1.0,2.0"])
+    ]
     assert swept == [1.0, 2.0]
     with pytest.raises(InputError, match=r"unknown key estimator\.d1; known: estimator\.d0, "):
         Experiment.compose([*own, "estimator.d1=3.0"])
@@ -121,4 +124,4 @@ def test_an_option_of_a_folder_is_called_by_its_last_part():
     experiment = Experiment.compose(["estimator=peers/kiss_icp_tuned"])
     assert experiment.estimator_name == "kiss_icp_tuned"
     assert experiment.options_of("estimator")["voxel_size_m"] == 0.2
-    assert option_called("estimator", "kiss_icp") == "peers/kiss_icp"
+    assert find_option("estimator", "kiss_icp") == "peers/kiss_icp"

@@ -13,7 +13,7 @@ import pytest
 
 from experiments.report.export import as_text, to_markdown
 from experiments.runs import store
-from experiments.runs.console import end, show
+from experiments.runs.console import exit_with, show
 from experiments.sweeps.launch import _drop, prepare
 from sim.errors import InputError, printable
 from sim.formats.detect import read_any
@@ -53,7 +53,7 @@ def test_messages_are_one_printable_line_that_keeps_its_remedy(capsys):
     assert len(str(error)) < 2100
     assert str(error).endswith("; delete it")
     with pytest.raises(SystemExit):
-        end(error)
+        exit_with(error)
     show(f"one\n{EVIL}\tthree")
     out, err = capsys.readouterr()
     assert err.count("\n") == 1

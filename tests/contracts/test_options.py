@@ -1,6 +1,8 @@
 """Each check of an option accepts its bounds, and names the key of what it rejects."""
 
 import dataclasses
+import hashlib
+from dataclasses import MISSING
 
 import numpy as np
 import pytest
@@ -8,16 +10,19 @@ from omegaconf import OmegaConf
 
 from estimators.base import Prior
 from experiments.runs.paths import packaged
+from sim import sensors
 from sim.errors import InputError
 from sim.options import described, find
-from sim.robot.drive import RobotGeometry
+from sim.robot.drive import DifferentialDrive, RobotGeometry
 from sim.sensors import Encoder, Laser
 
-_FILES = packaged("conf/estimator").glob("*.yaml")
+_FILES = packaged("conf/estimator").rglob("*.yaml")
 _TARGETS = {OmegaConf.load(path).get("_target_") for path in _FILES} - {None}
 ESTIMATORS = list(
     filter(dataclasses.is_dataclass, (find(name, "estimator") for name in sorted(_TARGETS)))
 )
+SENSORS = [getattr(sensors, name) for name in sensors.__all__]
+SENSORS = [cls for cls in SENSORS if hasattr(cls, "schema") and dataclasses.is_dataclass(cls)]
 
 
 @pytest.mark.parametrize("cls", ESTIMATORS)
@@ -56,3 +61,51 @@ def test_the_start_pose_is_a_copy():
     start.mean[0], start.covariance[0, 0] = 1.0, 2.0
     assert prior.mean[0] == 0.0
     assert prior.covariance[0, 0] == 1.0
+
+
+def digest_of_defaults(options):
+    defaults = sorted((o.name, repr(o.default)) for o in options if o.default is not MISSING)
+    return hashlib.sha256(repr(defaults).encode()).hexdigest()[:8]
+
+
+# A default decides results: who changes one says so in CHANGELOG.md, and here.
+DEFAULTS = {
+    "DifferentialDrive": "4c424886",
+    "EkfIcp": "9ee61b3a",
+    "EkfIcpPaper": "5fb40063",
+    "EkfSlam": "0be448aa",
+    "Encoder": "9c7c1c0b",
+    "External": "a594d99f",
+    "FastSLAM": "8a3a567e",
+    "FixedLag": "e1bb130b",
+    "GraphSlam": "4461e0a7",
+    "GtsamBatch": "44b30ce1",
+    "GtsamIsam2": "96bf5a4b",
+    "Gyroscope": "819bc6ea",
+    "IcpOdometry": "ad2ff2e5",
+    "KissIcp": "105071ed",
+    "Laser": "15ad3451",
+    "Lidar3D": "29cea5d0",
+    "Mcl": "3eeb5e77",
+    "Odometry": "8ff5b00a",
+    "Offline": "f6fdb4d2",
+    "PlaceDescriptor": "af6aa1df",
+    "RealCamera": "8d155e5d",
+    "RealLaser": "5e4f23d4",
+    "RobotCamera": "d05fb434",
+    "SmallGicp": "7b59f3f4",
+    "Smoother": "1f3b75cc",
+    "StereoCamera": "312bf8bc",
+    "TopologicalMcl": "9f9972d0",
+}
+
+
+def test_no_default_changes_unseen():
+    configured = (*ESTIMATORS, *SENSORS, DifferentialDrive)
+    assert {cls.__name__: digest_of_defaults(described(cls)) for cls in configured} == DEFAULTS
+
+
+def test_a_changed_default_is_seen():
+    first, *others = described(Laser)
+    changed = [dataclasses.replace(first, default=first.default + 1), *others]
+    assert digest_of_defaults(changed) != digest_of_defaults(described(Laser))

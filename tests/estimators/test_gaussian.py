@@ -56,7 +56,7 @@ def test_then_and_seen_from_move_samples_as_they_say():
     mount = np.array([0.3, -0.2, 0.7])
     a = rng.multivariate_normal(first.mean, first.covariance, 200_000)
     b = rng.multivariate_normal(motion.mean, motion.covariance, 200_000)
-    seen, by_motion = motion.seen_from(mount)
+    seen, by_motion = motion.in_sensor(mount)
     conjugate = se2.compose(se2.compose(se2.inverse(mount), b), mount)
     for belief, samples in ((first.then(motion), se2.compose(a, b)), (seen, conjugate)):
         np.testing.assert_allclose(belief.mean, samples.mean(axis=0), atol=1e-3)

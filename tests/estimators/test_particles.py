@@ -9,10 +9,10 @@ from estimators.particles import (
     SCHEMES,
     Lineages,
     effective_sample_size,
-    in_place,
+    have_underflowed,
+    keep_survivors,
     normalize,
     resample,
-    underflowed,
 )
 from sim.errors import InputError
 
@@ -32,8 +32,8 @@ def test_normalize_takes_any_offset():
 @pytest.mark.parametrize("hopeless", [-np.inf, np.nan])
 def test_weights_without_any_left_count_as_equal(hopeless):
     spent = np.full(4, hopeless)
-    assert underflowed(spent)
-    assert not underflowed(logs(WEIGHTS))
+    assert have_underflowed(spent)
+    assert not have_underflowed(logs(WEIGHTS))
     assert normalize(spent).tolist() == [0.25] * 4
     assert effective_sample_size(spent) == pytest.approx(4.0)
     assert resample(spent, 4, np.random.default_rng(0)).tolist() == [0, 1, 2, 3]
@@ -106,7 +106,7 @@ def test_equal_weights_and_one_particle(scheme):
 @settings(max_examples=60, deadline=None)
 def test_survivors_keep_their_slot(drawn):
     indices = np.array(drawn)
-    ancestors = in_place(indices, 12)
+    ancestors = keep_survivors(indices, 12)
     assert np.array_equal(np.sort(ancestors), np.sort(indices))
     for particle in set(drawn):
         assert ancestors[particle] == particle

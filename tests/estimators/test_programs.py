@@ -24,7 +24,7 @@ from experiments.runs.row import Outcome
 from experiments.runs.version import version_with
 from sim.errors import InputError
 from sim.recording import load, save
-from sim.worlds.grid import rasterized
+from sim.worlds.grid import rasterize
 from sim.worlds.grid_file import read_grid
 from tests.fixtures import fakes
 
@@ -198,7 +198,7 @@ def test_a_program_that_reads_late_is_waited_for(recording, tmp_path):
         "import sys, time\ntime.sleep(0.3)\n"
         f"for line in sys.stdin: print('{_BELIEF}', flush=True)\n"
     )
-    grid = rasterized(recording.known_world, 0.01, 0.5)  # far more than a pipe holds
+    grid = rasterize(recording.known_world, 0.01, 0.5)  # far more than a pipe holds
     prior = fakes.tracking_prior(recording)
     prior = type(prior)(**{**vars(prior), "map": grid})
     online, _ = run(External(command=[sys.executable, str(path)]), recording.cut(3), prior)
@@ -307,7 +307,7 @@ def test_wrong_settings_of_offline_programs_are_named(settings, message):
 def test_a_program_gets_a_grid_of_the_map(recording, tmp_path, known):
     """Of a world that at the laser's height, in the form that every map server reads."""
     prior, kept = fakes.tracking_prior(recording), tmp_path / "kept"
-    expected = rasterized(prior.map, 0.05, recording.sensors["laser"].mount.z_m)
+    expected = rasterize(prior.map, 0.05, recording.sensors["laser"].mount.z_m)
     if known == "grid":
         prior = dataclasses.replace(prior, map=expected)
     copied = f"cp -r $(dirname {{grid}}) {kept} && echo 0 0 0 0 0 0 0 1 > {{out}}"

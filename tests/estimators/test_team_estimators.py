@@ -17,8 +17,8 @@ from estimators.landmarks.stereo import StereoModel
 from estimators.team import Communication, run_team
 from estimators.wheels import WheelPrediction
 from experiments.evaluation.metrics import nees
+from experiments.runs.evaluate import in_range
 from experiments.runs.experiment import Experiment
-from experiments.runs.team import in_range
 from sim import se2
 from sim.errors import InputError
 from sim.recording import Log
@@ -422,7 +422,7 @@ def test_wrong_teams_are_refused(overrides, complaint):
 def test_first_robots_of_a_simulated_team():
     short = ["study=teams", "route.distance_m=2", "world.n_landmarks=10", "team.size=3"]
     wide = ["sensors.robots.fov_horizontal_rad=3.1", "sensors.robots.max_distance_m=30"]
-    team = Experiment.compose([*short, *wide]).simulated()
+    team = Experiment.compose([*short, *wide]).simulate_team()
     two = team.first(2)
     assert len(two) == 2
     assert set(np.concatenate([r.logs["robots"]["ids"] for r in two.robots])) <= {0, 1}

@@ -51,7 +51,7 @@ def test_the_joint_covariance_is_that_of_the_whole_jacobian():
     by_motion = slope(lambda u: se2.compose(pose, u), motion.motion.mean)
     expected = F @ P @ F.T
     expected[:3, :3] += by_motion @ motion.motion.covariance @ by_motion.T
-    mean = motion.applied(pose, P, slice(0, 3), slice(3, 6))
+    mean = motion.apply(pose, P, slice(0, 3), slice(3, 6))
     assert np.allclose(mean, moved(np.concatenate([pose, GAINS, np.zeros(3)]))[:3])
     assert np.allclose(P, expected, atol=1e-8)
 

@@ -7,7 +7,7 @@ import pytest
 
 from sim.errors import InputError
 from sim.files import write_whole
-from sim.recording import Log, Recording, Truth, WheelLog, joined, load, save
+from sim.recording import Log, Recording, Truth, WheelLog, load, log_of_readings, save
 from sim.robot.drive import RobotGeometry
 from sim.sensors import Encoder, Field, Laser, StereoCamera
 from sim.worlds.world import World
@@ -232,7 +232,7 @@ def test_a_log_gives_its_readings():
     }
     assert (first["count"], second["count"]) == (1, 2)
     assert second["points"].shape == (0, 2)
-    again = joined(SCHEMA, log.stamps, [first, second], "s")
+    again = log_of_readings(SCHEMA, log.stamps, [first, second], "s")
     for name, values in log.values.items():
         assert again[name].dtype == values.dtype
         np.testing.assert_array_equal(again[name], values)
@@ -293,21 +293,21 @@ def test_log_of_a_sensor_wants_its_fields():
 
 def test_readings_are_joined_by_their_field():
     plain, ragged = Field(shape=(2,)), Field(dtype="i8", shape=(None,), ragged=True)
-    assert plain.joined([[1, 2], (3, 4), np.zeros(2)], "f").tolist() == [[1, 2], [3, 4], [0, 0]]
-    assert Field().joined([1.0, np.array(2.0)], "f").tolist() == [1.0, 2.0]
-    rows = ragged.joined([np.ones((2, 3)), np.zeros((0, 3)), np.ones((1, 3))], "f")
+    assert plain.stack([[1, 2], (3, 4), np.zeros(2)], "f").tolist() == [[1, 2], [3, 4], [0, 0]]
+    assert Field().stack([1.0, np.array(2.0)], "f").tolist() == [1.0, 2.0]
+    rows = ragged.stack([np.ones((2, 3)), np.zeros((0, 3)), np.ones((1, 3))], "f")
     assert (rows.shape, rows.dtype) == ((3, 3), np.int64)
-    assert plain.joined([], "f").shape == (0, 2)
-    assert ragged.joined([], "f").shape == (0, 0)
+    assert plain.stack([], "f").shape == (0, 2)
+    assert ragged.stack([], "f").shape == (0, 0)
     with pytest.raises(InputError, match=r"f must have shape \(1, 2\), got \(1, 3\)"):
-        plain.joined([[1, 2, 3]], "f")
+        plain.stack([[1, 2, 3]], "f")
     for field, readings in (
         (plain, [[1, 2], [1, 2, 3]]),
         (ragged, [np.ones((1, 3)), np.ones((1, 2))]),
         (Field(), ["north"]),
     ):
         with pytest.raises(InputError, match="f: readings that do not go together"):
-            field.joined(readings, "f")
+            field.stack(readings, "f")
     with pytest.raises(InputError, match=r"dtype must be one of .*'complex'"):
         Field(dtype="complex")
 
@@ -320,9 +320,9 @@ def test_ragged_fields_of_a_reading_have_as_many_rows():
         {"points": np.ones((1, 2)), "ids": np.zeros(2)},
     ]
     with pytest.raises(InputError, match=r"s\.ids has 1 rows? in a reading, s\.points 2"):
-        joined(schema, np.zeros(2), odd, "s")
+        log_of_readings(schema, np.zeros(2), odd, "s")
     with pytest.raises(InputError, match=r"s\.ids: readings that do not go together"):
-        joined(schema, np.zeros(1), [{"points": np.ones((1, 2)), "ids": 3}], "s")
+        log_of_readings(schema, np.zeros(1), [{"points": np.ones((1, 2)), "ids": 3}], "s")
 
 
 @pytest.mark.parametrize("damage", ["cut", "flip", "empty", "text", "other_zip"])

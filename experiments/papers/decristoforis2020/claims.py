@@ -9,7 +9,15 @@ import pandas as pd
 
 from experiments.evaluation.registration_errors import METRICS
 from experiments.evaluation.statistics import Interval, log_ratio_interval, mean_interval
-from experiments.judging.claim import Claim, Subject, Verdict, banded, beside, lower, shown
+from experiments.judging.claim import (
+    Claim,
+    Subject,
+    Verdict,
+    beside,
+    judge_bounds,
+    judge_lower,
+    shown,
+)
 from experiments.judging.results import Results
 from experiments.papers.decristoforis2020.settings import CONSISTENT, PLACES, RATE_HZ
 from sim.arrays import Array
@@ -54,7 +62,7 @@ def judge(results: Results) -> list[Claim]:
 def dc1(runs: pd.DataFrame, ordering: pd.DataFrame) -> list[Claim]:
     """DC1: fusion beats ICP, and ICP beats odometry, in position and in heading.
 
-    Headlines are the paper's own forms. Beside stand the heading error over 10 m; ICP started from
+    Headlines are the paper's own forms. Secondary: the heading error over 10 m; ICP started from
     the wheels, as the fusion is, which tells what the start adds from what fusion adds; our fusion;
     and the region of slip and range noise in which the paper's order holds.
     """
@@ -91,7 +99,9 @@ def dc2(ellipses: pd.DataFrame) -> Iterator[Claim]:
             ("near objects", "long axis near objects over bare", shrinks, (-np.inf, 0.5)),
         ):
             about = Subject("DC2", quantity, method=method)
-            yield beside(banded(about, label + where, found, *bounds, n=n), method != "printed")
+            yield beside(
+                judge_bounds(about, label + where, found, *bounds, n=n), method != "printed"
+            )
 
 
 def dc3(ellipses: pd.DataFrame) -> Iterator[Claim]:
@@ -115,7 +125,7 @@ def dc3(ellipses: pd.DataFrame) -> Iterator[Claim]:
             ("turn", f"turn of the long axis {turn}", turned, (10.0,)),
         ):
             about = Subject("DC3", quantity, method=method, place=bend)
-            claim = banded(about, label, found, *bounds, n=n)
+            claim = judge_bounds(about, label, found, *bounds, n=n)
             yield beside(claim, is_beside or method != "printed" or quantity in ("median", "turn"))
 
 
@@ -139,7 +149,7 @@ def dc4(covariances: pd.DataFrame) -> Iterator[Claim]:
                 found, (low, high) = nees[metric, place, method], CONSISTENT
                 what = f"ANEES over dof of {method}, {metric}, {place}"
                 about = Subject("DC4", "ANEES", method=method, metric=metric, place=place)
-                claim = banded(about, what, found, low, high, n=n)
+                claim = judge_bounds(about, what, found, low, high, n=n)
                 if method.startswith("hessian"):
                     claim = replace(
                         claim,
@@ -156,11 +166,11 @@ def dc4(covariances: pd.DataFrame) -> Iterator[Claim]:
         slower = log_ratio_interval(times["sampling"], times["censi_last"])
         label = f"time of sampling over Censi's closed form, {metric}"
         about = Subject("DC4", "time", method="sampling", over="censi_last", metric=metric)
-        yield beside(banded(about, label, slower, at_least=10.0), is_beside)
+        yield beside(judge_bounds(about, label, slower, at_least=10.0), is_beside)
         faster = log_ratio_interval(times["hessian"], times["sampling"])
         label = f"time of Hessian over sampling, {metric}"
         about = Subject("DC4", "time", method="hessian", over="sampling", metric=metric)
-        yield beside(banded(about, label, faster, at_most=0.1))
+        yield beside(judge_bounds(about, label, faster, at_most=0.1))
 
 
 def nees_intervals(covariances: pd.DataFrame) -> dict[tuple[str, str, str], Interval]:
@@ -188,7 +198,9 @@ def dc5(metrics: pd.DataFrame) -> Iterator[Claim]:
                 ratio, n = log_ratio_interval(*pairs), len(wide.loc[kind])
                 label = f"{what}, point to {better} over point to point, {kind}"
                 about = Subject("DC5", what, metric=f"point_to_{better}", place=kind)
-                yield beside(banded(about, label, ratio, at_most=at_most, n=n), better == "line")
+                yield beside(
+                    judge_bounds(about, label, ratio, at_most=at_most, n=n), better == "line"
+                )
 
 
 def dc6(runs: pd.DataFrame) -> list[Claim]:
@@ -210,7 +222,7 @@ def _order(
     """Judge that a column is lower by the first method of a pair than by the second."""
     better, worse = pair
     about = Subject(claim, quantity, method=better, over=worse)
-    return lower(about, f"{quantity}, {better} over {worse}", *_paired(table, column, *pair))
+    return judge_lower(about, f"{quantity}, {better} over {worse}", *_paired(table, column, *pair))
 
 
 def judged_runs(runs: pd.DataFrame) -> pd.DataFrame:

@@ -10,7 +10,7 @@ import pandas as pd
 from estimators.base import Estimate
 from estimators.gaussian import STILL, Gaussian
 from estimators.laser import icp_covariance
-from estimators.laser.icp import USUAL, Metric, Rules, prepare, register
+from estimators.laser.icp import DEFAULT_RULES, Metric, Rules, prepare, register
 from estimators.laser.scan_matching import FAILED
 from experiments.evaluation.metrics import travelled_m
 from experiments.evaluation.scan_bound import fisher_bound
@@ -88,7 +88,7 @@ def ellipse_path(
     world: World,
     metric: Metric,
     scans: icp_covariance.Scans,
-    neighbours: int = USUAL.neighbours,
+    neighbours: int = DEFAULT_RULES.neighbours,
 ) -> pd.DataFrame:
     """Ellipse of each registration of successive scans, in the axes of the map, along the path.
 
@@ -114,7 +114,7 @@ def ellipse_path(
         if found.status in FAILED:
             continue
         R = icp_covariance.censi(found, source, target, sigma_m, scans=scans, everywhere=True)
-        step, _ = Gaussian(found.T_target_source, R).seen_from(se2.inverse(mount))
+        step, _ = Gaussian(found.T_target_source, R).in_sensor(se2.inverse(mount))
         rows.append((i, found.status == "degenerate", step.covariance[:2, :2]))
     use, degenerate, in_base = (np.array(column) for column in zip(*rows, strict=True))
     cos, sin = np.cos(truth[use - 1, 2]), np.sin(truth[use - 1, 2])

@@ -25,8 +25,8 @@ from experiments.evaluation.metrics import (
     nees_at_distances,
     position_errors_m,
 )
-from experiments.evaluation.registration_errors import METRICS, measured, scenes
-from experiments.judging.jobs import Progress, Tables, grouped, tables_of
+from experiments.evaluation.registration_errors import METRICS, measure, sample_scenes
+from experiments.judging.jobs import Progress, Tables, group_by, tables_of
 from experiments.judging.logs import DATA
 from experiments.judging.results import Profile, Results
 from experiments.papers.decristoforis2020.claims import judged_runs
@@ -47,7 +47,7 @@ from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Outcome, Row
 from experiments.runs.seeds import stream
-from experiments.sweeps.plan import planned
+from experiments.sweeps.plan import plan_experiments
 from sim.arrays import Array
 from sim.recording import Recording
 from sim.sensors import Laser, sensor_of
@@ -106,11 +106,13 @@ def _jobs(full: bool, out: Results) -> list[Job]:
     seeds = range(JUDGED_SEED, JUDGED_SEED + n)
     (office,) = _planned("methods", 1, "route.distance_m=300.0", *shorter)
     first, *others = _planned("corridor", n)
-    adjusted = grouped(
-        planned(["study=decristoforis2020/tuning", *([] if full else ["seed=60", *short])]),
+    adjusted = group_by(
+        plan_experiments(
+            ["study=decristoforis2020/tuning", *([] if full else ["seed=60", *short])]
+        ),
         lambda run: run.recording_key,
     )
-    on_log = list(planned(["study=decristoforis2020/log"])) if DATA.is_dir() else []
+    on_log = list(plan_experiments(["study=decristoforis2020/log"])) if DATA.is_dir() else []
     return [
         (drawn, _drawn_office, [_only(PAPERS_OWN, office), out]),
         *((0.5, _drawn_log, [group, out]) for group in ([on_log] if on_log else [])),
@@ -145,8 +147,8 @@ def _jobs(full: bool, out: Results) -> list[Job]:
 def _planned(study: str, n_seeds: int, *overrides: str) -> list[list[Experiment]]:
     """Experiments of conf/study/decristoforis2020/*.yaml, grouped by recording."""
     seeds = f"seed=range({JUDGED_SEED},{JUDGED_SEED + n_seeds})"
-    runs = planned([f"study=decristoforis2020/{study}", seeds, *overrides])
-    return grouped(runs, lambda run: run.recording_key)
+    runs = plan_experiments([f"study=decristoforis2020/{study}", seeds, *overrides])
+    return group_by(runs, lambda run: run.recording_key)
 
 
 def _only(methods: Sequence[str], group: Sequence[Experiment]) -> list[Experiment]:
@@ -307,8 +309,8 @@ def _scenes(seed: int, place: str, n_repeats: int) -> Tables:
     experiment = Experiment.compose([f"study=decristoforis2020/{study}", f"seed={seed}"])
     laser = sensor_of(experiment.sensors(), "laser", Laser)
     rng = stream(seed, f"scenes/{place}")
-    (scene,) = scenes(experiment.world(), part, laser.mount.pose, rng, 1)
-    found = measured(scene, laser, rng, n_repeats, max(2, n_repeats // 4))
+    (scene,) = sample_scenes(experiment.world(), part, laser.mount.pose, rng, 1)
+    found = measure(scene, laser, rng, n_repeats, max(2, n_repeats // 4))
     return {"covariances": found.assign(seed=seed, place=place)}
 
 

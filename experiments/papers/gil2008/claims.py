@@ -25,13 +25,13 @@ from experiments.judging.claim import (
     Role,
     Subject,
     Verdict,
-    banded,
     beside,
-    equivalent,
     holds,
+    judge_bounds,
+    judge_equivalent,
     more_by_p,
-    remarked,
     shown,
+    with_remark,
 )
 from experiments.judging.results import Results
 from experiments.judging.sentences import percent
@@ -72,7 +72,7 @@ def judge(results: Results) -> list[Claim]:
     ]
 
 
-def pooled(table: pd.DataFrame, column: str, by: str) -> pd.DataFrame:
+def pool_by_world(table: pd.DataFrame, column: str, by: str) -> pd.DataFrame:
     """Root mean square of a column, one row per world and one column per value of `by`."""
     squares = (table[column] ** 2).groupby([table["seed"], table[by]]).mean()
     return squares.unstack(by).dropna() ** 0.5
@@ -100,13 +100,17 @@ def gi1(particles: pd.DataFrame, laps: pd.DataFrame) -> Iterator[Claim]:
         where, is_beside = f"{NAMES[name]}, {NOISE[noise]}", not _printed(name, noise)
         found = {}
         for m, part in table.groupby("n_particles"):
-            ours, odometry = (pooled(part, c, "filter") for c in (POSITION, "odometry_rmse_m"))
+            ours, odometry = (
+                pool_by_world(part, c, "filter") for c in (POSITION, "odometry_rmse_m")
+            )
             found[m] = log_ratio_interval(ours[name], odometry[name]), len(ours)
         m, (worst, n) = max(found.items(), key=lambda item: item[1][0].high)
         label = f"error of SLAM over odometry's, the worst of M >= 50: {where}"
         about = Subject("GI1", "over odometry", method=name, noise=noise, size=int(m))
-        claim = banded(about, label, worst, at_most=BOUNDED, criterion=f"below {BOUNDED:g}", n=n)
-        yield beside(remarked(claim, f"M = {m}"), is_beside)
+        claim = judge_bounds(
+            about, label, worst, at_most=BOUNDED, criterion=f"below {BOUNDED:g}", n=n
+        )
+        yield beside(with_remark(claim, f"M = {m}"), is_beside)
     yield from _revisits(laps)
     own = mean_interval(particles.groupby("seed")["odometry_rmse_m"].mean())
     about = Subject("GI1", "odometry")
@@ -121,11 +125,11 @@ def _revisits(laps: pd.DataFrame) -> Iterator[Claim]:
     own = _growth(laps.drop_duplicates("seed"), "odometry_revisit_ratio")
     n = laps["seed"].nunique()
     about, words = Subject("GI1", "revisits", method="odometry"), f"error of odometry {label}"
-    yield beside(banded(about, words, own, REVISITS_GROW, criterion=grows, n=n))
+    yield beside(judge_bounds(about, words, own, REVISITS_GROW, criterion=grows, n=n))
     for (noise, name), table in laps.groupby(["noise", "filter"], sort=False):
         growth, words = _growth(table, "revisit_ratio"), f"{NAMES[name]}, {NOISE[noise]}"
         about, words = Subject("GI1", "revisits", method=name, noise=noise), f"{label}: {words}"
-        claim = banded(
+        claim = judge_bounds(
             about, f"error of SLAM {words}", growth, at_most=REVISITS_GROW, criterion=criterion, n=n
         )
         if not own.low > REVISITS_GROW:
@@ -164,8 +168,8 @@ def gi3(particles: pd.DataFrame) -> Iterator[Claim]:
             is_beside = name != "paper" or column != POSITION
             label, ones = f"{what} error, M = 200 over M = 1000", np.ones(len(values))
             about = Subject("GI3", what, method=name, noise="paper")
-            claim = equivalent(about, f"{label}: {NAMES[name]}", values, ones, 0.25)
-            claim = remarked(claim, remark, n_recordings=n_recordings, n_worlds=len(values))
+            claim = judge_equivalent(about, f"{label}: {NAMES[name]}", values, ones, 0.25)
+            claim = with_remark(claim, remark, n_recordings=n_recordings, n_worlds=len(values))
             yield beside(claim, is_beside)
             found, about = log_ratio_interval(values, ones), replace(about, arm="significance")
             verdict = holds(not found.low > 1.0) if np.isfinite(found.low) else Verdict.UNDECIDED
@@ -177,10 +181,10 @@ def gi3(particles: pd.DataFrame) -> Iterator[Claim]:
 def gi4(distance: pd.DataFrame) -> Iterator[Claim]:
     """GI4: the error falls with dmax."""
     for about, words, is_beside, is_ours, part in _kinds("GI4", distance[distance["occluded"]]):
-        errors = pooled(part, POSITION, "max_distance_m")
+        errors = pool_by_world(part, POSITION, "max_distance_m")
         found = log_ratio_interval(errors[3], errors[10])
         label, n = f"position error, dmax = 3 m over 10 m: {words}", len(errors)
-        claim = banded(about, label, found, at_least=1.5, criterion="above 1.5", n=n)
+        claim = judge_bounds(about, label, found, at_least=1.5, criterion="above 1.5", n=n)
         yield shown(about, label, found) if is_ours else beside(claim, is_beside)
 
 
@@ -194,10 +198,12 @@ def gi5(distance: pd.DataFrame) -> Iterator[Claim]:
         values = ratios(part, POSITION, "max_distance_m", 10, 20)
         found = log_ratio_interval(values, np.ones(len(values)), level=0.90)
         label = f"position error, dmax = 10 m over 20 m (90 % interval): {words}"
-        claim = banded(about, label, found, at_most=NOT_WORSE, criterion="below 1.3", n=len(values))
+        claim = judge_bounds(
+            about, label, found, at_most=NOT_WORSE, criterion="below 1.3", n=len(values)
+        )
         if far < 0.1:
             claim = _undecided(claim, "too few far observations")
-        claim = remarked(claim, f"{percent(far)} of observations beyond 10 m", far=far)
+        claim = with_remark(claim, f"{percent(far)} of observations beyond 10 m", far=far)
         yield shown(about, label, found, claim.reason) if is_ours else beside(claim, is_beside)
 
 
@@ -227,9 +233,9 @@ def gi7(association: pd.DataFrame) -> Iterator[Claim]:
             )
             both = pd.concat([part.set_index("seed")[POSITION], known], axis=1, join="inner")
             about = Subject("GI7", "descriptor", method=name, noise=noise, setting=sigma)
-            claim = equivalent(about, label, both.iloc[:, 0], both.iloc[:, 1], 0.5)
+            claim = judge_equivalent(about, label, both.iloc[:, 0], both.iloc[:, 1], 0.5)
             words = f"descriptors alone match {percent(alone)}, together {percent(right)} are right"
-            yield beside(remarked(claim, words), is_beside or sigma != _DESCRIPTORS)
+            yield beside(with_remark(claim, words), is_beside or sigma != _DESCRIPTORS)
         guessed = table[table["association"] == "mahalanobis"].set_index("seed")
         single = association[
             (association["filter"] == "ekf_slam") & (association["noise"] == noise)
@@ -245,7 +251,9 @@ def gi7(association: pd.DataFrame) -> Iterator[Claim]:
         yield beside(_divergence(about, ekf > 0.5, particles > 0.5, where), is_beside)
         label = f"error of EKF-SLAM over FastSLAM's, both by Mahalanobis distance: {where}"
         about = replace(about, quantity="EKF-SLAM over FastSLAM")
-        yield beside(banded(about, label, log_ratio_interval(ekf, particles), 1.0, n=len(ekf)))
+        yield beside(
+            judge_bounds(about, label, log_ratio_interval(ekf, particles), 1.0, n=len(ekf))
+        )
 
 
 def _divergence(
@@ -284,7 +292,7 @@ def gi8(cost: pd.DataFrame) -> Iterator[Claim]:
         repeats = table.groupby("repeat")
         found = mean_interval([log_log_slope(p["n_landmarks"], p["step_ms"]) for _, p in repeats])
         label = f"exponent of N in the time of a step, {maps} maps, resampling at every image"
-        yield banded(
+        yield judge_bounds(
             Subject("GI8", "exponent", arm=maps), label, found, *bands[maps], n=len(repeats)
         )
     wide = cost.groupby(["n_landmarks", "maps"])["step_ms"].median().unstack("maps")
@@ -341,7 +349,7 @@ def _trends(
     Aligned errors are ours, and stand beside.
     """
     for column, what in ERRORS.items():
-        errors = pooled(table, column, by)
+        errors = pool_by_world(table, column, by)
         (first, *_, last), p, n = errors.columns, page_trend_p(errors), len(errors)
         verdict, more = Verdict.NOT_REPRODUCED, 0
         if p < limit:

@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 
 from experiments.evaluation.metrics import rms
 from experiments.judging.results import Arrays, Results
-from experiments.papers.gil2008.claims import pooled
+from experiments.papers.gil2008.claims import pool_by_world
 from experiments.papers.gil2008.settings import CELL_M
 from experiments.viewing.grid import UNKNOWN, draw_grid
 from experiments.viewing.plotting import (
@@ -462,7 +462,7 @@ def _by_filter(ax: Axes, table: pd.DataFrame, by: str, column: str) -> None:
 
 def _intervals(part: pd.DataFrame, by: str, column: str) -> tuple[pd.Series[float], Array]:
     """Geometric mean (K,) over worlds of a column's RMS, and (2, K) down and up to 95 %."""
-    logs = np.log(pooled(part, column, by))
+    logs = np.log(pool_by_world(part, column, by))
     middle, half = np.exp(logs.mean()), 2.0 * logs.sem().fillna(0.0)
     return middle, np.array([-middle * np.expm1(-half), middle * np.expm1(half)])
 

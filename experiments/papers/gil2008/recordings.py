@@ -20,10 +20,10 @@ from experiments.runs.schema import Config
 from experiments.runs.seeds import stream
 from sim.arrays import Array
 from sim.errors import InputError
-from sim.recording import Log, Recording, WheelLog, joined
+from sim.recording import Log, Recording, WheelLog, log_of_readings
 from sim.robot.slip import wheel_errors
 from sim.sensors import StereoCamera, View, sensor_of, sensors_from_config
-from sim.sensors.base import parted, sensor_settings
+from sim.sensors.base import sensor_settings, split_schema
 from sim.sensors.rays import ExactRays
 from sim.worlds.world import World
 
@@ -73,7 +73,7 @@ class Scene:
 
 def recorded(config: Config, **_scene: Any) -> Recording:
     """Make the recording of a configuration; `Scene.of` reads the keys of its `recording`."""
-    return thinned(whole(config), config)
+    return thin(whole(config), config)
 
 
 def whole(config: Config) -> Recording:
@@ -98,8 +98,8 @@ def whole(config: Config) -> Recording:
         eye(View(stamp, pose, world, rays, stamp, pose))
         for stamp, pose in zip(stamps.tolist(), poses, strict=True)
     ]
-    seen, hidden = parted(camera.schema)
-    log, true = (joined(schema, stamps, images, "images") for schema in (seen, hidden))
+    seen, hidden = split_schema(camera.schema)
+    log, true = (log_of_readings(schema, stamps, images, "images") for schema in (seen, hidden))
     driven = driven.with_log("stereo", log, camera)
     return dataclasses.replace(
         driven,
@@ -110,7 +110,7 @@ def whole(config: Config) -> Recording:
     )
 
 
-def thinned(recording: Recording, config: Config) -> Recording:
+def thin(recording: Recording, config: Config) -> Recording:
     """Recording as a configuration's camera would take it.
 
     Landmarks are kept by their true distance. The same random order is used for every B, so the
@@ -129,7 +129,7 @@ def thinned(recording: Recording, config: Config) -> Recording:
         rank = np.empty(len(image), np.int64)
         rank[ranked] = np.arange(len(image)) - splits[image[ranked]]
         kept &= rank < camera.max_observations
-    schema, _ = parted(camera.schema)
+    schema, _ = split_schema(camera.schema)
     left = Log.of(
         camera,
         log.stamps,

@@ -52,7 +52,7 @@ def matching_precision(recording: Recording) -> float:
     return float(np.mean(ids[nearest] == true[again]))
 
 
-def revisited(truth: Array) -> NDArray[np.bool_]:
+def on_revisited_ground(truth: Array) -> NDArray[np.bool_]:
     """Rows (T,) where the robot is within a metre of where it was at least 20 m of path ago."""
     travelled = travelled_m(truth)
     near = np.hypot(*(truth[:, None, :2] - truth[None, :, :2]).transpose(2, 0, 1)) < WITHIN_M

@@ -14,15 +14,15 @@ import numpy as np
 from estimators.odometry import Odometry
 from experiments.bench.fastslam import cost_by_landmarks
 from experiments.evaluation.metrics import position_errors_m, rms, travelled_m
-from experiments.judging.jobs import Progress, Tables, grouped, tables_of
+from experiments.judging.jobs import Progress, Tables, group_by, tables_of
 from experiments.judging.results import Profile, Results
 from experiments.papers.gil2008 import scores, settings
-from experiments.papers.gil2008.recordings import Scene, landmark_distances_m, thinned, whole
-from experiments.runs.evaluate import run_over, scored, status_of
+from experiments.papers.gil2008.recordings import Scene, landmark_distances_m, thin, whole
+from experiments.runs.evaluate import run_over, score_run, status_of
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Row
 from experiments.runs.seeds import stream
-from experiments.sweeps.plan import planned
+from experiments.sweeps.plan import plan_experiments
 from experiments.viewing.map import grid_along
 from sim import se2
 from sim.arrays import Array
@@ -63,7 +63,7 @@ def run(profile: Profile, out: Results, on_progress: Progress) -> None:
 
     jobs = [
         [part[low : low + _RUNS_PER_JOB]]
-        for part in grouped(plan(profile), drawn_from)
+        for part in group_by(plan(profile), drawn_from)
         for low in range(0, len(part), _RUNS_PER_JOB)
     ]
     tables = tables_of(rows_of, jobs, lambda share: on_progress(0.95 * share))
@@ -77,10 +77,12 @@ def plan(profile: Profile) -> Iterator[TableRun]:
     n_draws, n_repeats = settings.N_DRAWS[profile], settings.N_REPEATS[profile]
     for table in settings.LABELS:
         few = profile is Profile.QUICK and table != "repeats"  # which has one world
-        for one in planned([f"study=gil2008/{table}", *few * [f"seed={settings.QUICK_SEEDS}"]]):
+        for one in plan_experiments(
+            [f"study=gil2008/{table}", *few * [f"seed={settings.QUICK_SEEDS}"]]
+        ):
             drawn = one.options_of("recording")
             if drawn["draw"] < n_draws and drawn["image_draw"] <= n_repeats:
-                yield table, one.replaced(repeats=min(one.repeats, n_repeats))
+                yield table, one.replace(repeats=min(one.repeats, n_repeats))
 
 
 def rows_of(runs: Sequence[TableRun]) -> Tables:
@@ -99,7 +101,7 @@ def rows_of(runs: Sequence[TableRun]) -> Tables:
     }
     rows: dict[str, list[Row]] = {}
     for table, experiment in runs:
-        seen = thinned(recording, experiment.config)
+        seen = thin(recording, experiment.config)
         labels = labels_of(table, experiment)
         shown = common | labels | _shown(seen)
         for repeat in range(experiment.repeats):
@@ -139,7 +141,7 @@ def one_run(experiment: Experiment, recording: Recording, rng: np.random.Generat
         recording, experiment.estimator(), experiment.prior(recording), rng, scores.KEEP
     )
     revised = revised or online
-    found = scored(recording, online, revised)
+    found = score_run(recording, online, revised)
     return {
         **status_of(recording, online).columns(),
         **{key: found[key] for key in _SCORES if key in found},
@@ -182,7 +184,7 @@ def write_arrays(out: Results) -> None:
             }
     out.write_arrays(
         "path",
-        revisited=scores.revisited(along[::4]),
+        revisited=scores.on_revisited_ground(along[::4]),
         **{name: values.astype(np.float32) for name, values in pictured.items()},
     )
     line, particles = particles_along_a_motion(stream(path.seed, "figure"))

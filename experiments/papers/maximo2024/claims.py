@@ -20,13 +20,13 @@ from experiments.judging.claim import (
     Claim,
     Subject,
     Verdict,
-    banded,
     beside,
-    equivalent,
-    lower,
+    judge_bounds,
+    judge_equivalent,
+    judge_lower,
     overall,
-    remarked,
     shown,
+    with_remark,
 )
 from experiments.judging.results import Results
 from experiments.papers.maximo2024.settings import (
@@ -108,13 +108,13 @@ def _m3_error(name: str, errors: pd.DataFrame) -> Claim | None:
         return _share(fails, label, errors["M3"] > 5.0 * errors["M2"], at_least=0.8)
     if name.startswith("umh"):
         label = f"error of M3 over M2, {NAMES[name]}"
-        return equivalent(about, label, errors["M3"], errors["M2"], 0.25)
+        return judge_equivalent(about, label, errors["M3"], errors["M2"], 0.25)
     return None
 
 
 def _m2_error(name: str, errors: pd.DataFrame) -> Claim:
     about = Subject("MX1", "error", method="M2", over="M1", place=NAMES[name])
-    return lower(about, f"error of M2 over M1, {NAMES[name]}", errors["M2"], errors["M1"])
+    return judge_lower(about, f"error of M2 over M1, {NAMES[name]}", errors["M2"], errors["M1"])
 
 
 def mx3(dispersion: pd.DataFrame, quality: pd.DataFrame) -> Iterator[Claim]:
@@ -133,7 +133,7 @@ def mx3(dispersion: pd.DataFrame, quality: pd.DataFrame) -> Iterator[Claim]:
 def _dispersion(method: str, name: str, worlds: pd.DataFrame) -> Claim:
     about = Subject("MX3", "dispersion", method=method, over="M1", place=NAMES[name])
     label = f"dispersion of {method} over M1 at step 10, {NAMES[name]}"
-    return lower(about, label, worlds[method] + _LEAST_M, worlds["M1"] + _LEAST_M)
+    return judge_lower(about, label, worlds[method] + _LEAST_M, worlds["M1"] + _LEAST_M)
 
 
 _m2_dispersion, _m3_dispersion = partial(_dispersion, "M2"), partial(_dispersion, "M3")
@@ -174,7 +174,7 @@ def _where(claim: Claim, compare: Compare, quality: pd.DataFrame, name: str) -> 
     good = cells.loc[cells["verdict"] == Verdict.REPRODUCED, "n_nearest"].tolist()
     where = f"B = {', '.join(map(str, good))}" if good else "no B"
     remark = f"holds at {where} of {', '.join(map(str, tried))}" if tried else ""
-    return remarked(claim, remark, holds_at=good, tried=tried)
+    return with_remark(claim, remark, holds_at=good, tried=tried)
 
 
 def mx2(particles: pd.DataFrame, times: pd.DataFrame) -> Iterator[Claim]:
@@ -188,14 +188,16 @@ def mx2(particles: pd.DataFrame, times: pd.DataFrame) -> Iterator[Claim]:
             f"error with more or fewer particles a node over that with 4, the worst, {NAMES[name]}"
         )
         about = Subject("MX2", "error", over="4 particles a node", place=NAMES[name])
-        each = {n: equivalent(about, label, errors[n], errors[4], 0.05) for n in errors if n != 4}
+        each = {
+            n: judge_equivalent(about, label, errors[n], errors[4], 0.05) for n in errors if n != 4
+        }
         worst = max(each, key=lambda n: abs(math.log(each[n].found.value)))
         verdict, more = (
             overall([c.verdict for c in each.values()]),
             max(c.more for c in each.values()),
         )
         claim = replace(each[worst], verdict=verdict, more=more)
-        claim = remarked(claim, f"{worst} particles a node")
+        claim = with_remark(claim, f"{worst} particles a node")
         yield beside(claim, name not in headlines(particles["geometry"]))
     for name, part in times.groupby("geometry", sort=False):
         counts = part.groupby("particles")["time_s"]
@@ -210,7 +212,7 @@ def mx2(particles: pd.DataFrame, times: pd.DataFrame) -> Iterator[Claim]:
                 *(float(getattr(each, end)()[most]) for end in ("median", "min", "max"))
             )
             about = Subject("MX2", "time", over=what, place=NAMES[name])
-            yield banded(about, label, found, at_most=0.1)
+            yield judge_bounds(about, label, found, at_most=0.1)
         (low, fewest), *_, (most, largest) = ((k, v.to_numpy()) for k, v in counts)
         grown = Interval(
             float(np.median(largest) / np.median(fewest)),
@@ -219,8 +221,8 @@ def mx2(particles: pd.DataFrame, times: pd.DataFrame) -> Iterator[Claim]:
         )
         label = f"time a node with the most particles over that with the fewest, {NAMES[name]}"
         about = Subject("MX2", "time", over="the fewest", place=NAMES[name])
-        claim = banded(about, label, grown, at_least=1.0, criterion="above 1")
-        yield remarked(claim, f"{most} particles over {low}")
+        claim = judge_bounds(about, label, grown, at_least=1.0, criterion="above 1")
+        yield with_remark(claim, f"{most} particles over {low}")
     yield from _oxford_slower(times)
 
 
@@ -239,7 +241,7 @@ def _oxford_slower(times: pd.DataFrame) -> Iterator[Claim]:
         )
         label = f"time a node over that of UMH, the smallest, {NAMES[oxford]}"
         about = Subject("MX2", "time", over="UMH", place=NAMES[oxford])
-        yield banded(about, label, found, at_least=1.0, criterion="above 1")
+        yield judge_bounds(about, label, found, at_least=1.0, criterion="above 1")
 
 
 def _share(
@@ -252,7 +254,7 @@ def _share(
     criterion: str = "",
 ) -> Claim:
     found = share_interval(int(hits.sum()), len(hits))
-    return banded(about, label, found, at_least, at_most, criterion=criterion, n=len(hits))
+    return judge_bounds(about, label, found, at_least, at_most, criterion=criterion, n=len(hits))
 
 
 def mx4(starts: pd.DataFrame) -> Iterator[Claim]:
@@ -280,7 +282,7 @@ def mx5(clusters: pd.DataFrame) -> Iterator[Claim]:
         about = Subject("MX5", "contiguous", method=descriptor, place=place)
         label = f"share of nodes with a route neighbour in their cluster, {place}"
         found, n = mean_interval(part), len(part)
-        claim = banded(about, label, found, at_least=0.8, criterion="above 0.8", n=n)
+        claim = judge_bounds(about, label, found, at_least=0.8, criterion="above 0.8", n=n)
         yield beside(claim, name not in decisive)
 
 
@@ -296,7 +298,7 @@ def mx7(starts: pd.DataFrame) -> Claim:
     worlds = starts.dropna(subset="rms_m").groupby("seed")[["spacing_m", "rms_m"]].mean()
     ratio = log_ratio_interval(worlds["spacing_m"], worlds["rms_m"])
     label = "node spacing over RMS error with refinement, campus clouds (our own)"
-    return banded(Subject("MX7", "spacing"), label, ratio, at_least=5.0, n=len(worlds))
+    return judge_bounds(Subject("MX7", "spacing"), label, ratio, at_least=5.0, n=len(worlds))
 
 
 def mx8(kidnapping: pd.DataFrame) -> Iterator[Claim]:

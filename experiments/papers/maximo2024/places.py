@@ -299,7 +299,7 @@ def query_recording(
     )
 
 
-def resequenced(recording: Recording, rows: NDArray[np.int64]) -> Recording:
+def resequence(recording: Recording, rows: NDArray[np.int64]) -> Recording:
     """The recording's observations in another order, each with the travel before it.
 
     Rows 100, 101, ... start elsewhere on the route; a jump in the rows is a kidnapping that the
@@ -315,12 +315,14 @@ def resequenced(recording: Recording, rows: NDArray[np.int64]) -> Recording:
         frame_stamps=new_stamps,
         wheels=WheelLog(new_stamps, np.cumsum(steps[rows], axis=0)),
         truth=Truth(new_stamps, recording.truth_at(stamps)[rows]),
-        logs={name: recording.log(name).taken(rows, new_stamps) for name in kept},
+        logs={name: recording.log(name).select(rows, new_stamps) for name in kept},
         commands=None,
     )
 
 
-def described(recording: Recording, describe: Callable[[Lidar3D, Floats], Floats]) -> Recording:
+def describe_clouds(
+    recording: Recording, describe: Callable[[Lidar3D, Floats], Floats]
+) -> Recording:
     """The recording with a place descriptor for each of its clouds."""
     lidar, clouds = recording.sensor("lidar3d", Lidar3D), recording.log("lidar3d")
     rows = np.array([describe(lidar, turn) for turn in clouds["ranges_m"]])
@@ -363,7 +365,7 @@ def route_recording(
     most = n - first_query
     if n_queries is not None and not 1 <= n_queries <= most:
         raise InputError(f"recording.n_queries must be from 1 to {most}, got {n_queries}")
-    part = resequenced(whole, np.arange(first_query, n)) if first_query else whole
+    part = resequence(whole, np.arange(first_query, n)) if first_query else whole
     return part if n_queries is None else part.cut(n_queries)
 
 
@@ -426,9 +428,9 @@ def mapping_run(
         What describes its clouds: a name of `estimators.topological.descriptors.KINDS`, or a
         network as in `described_run`.
     """
-    made = Experiment(config).replaced(seed=seed, recording=None).recording()
+    made = Experiment(config).replace(seed=seed, recording=None).recording()
     if network is not None:
-        made = described(made, _by_network(network))
+        made = describe_clouds(made, _by_network(network))
     return from_recording(made, descriptor, spacing_m)
 
 
@@ -442,7 +444,9 @@ def described_run(config: dict[str, Any], network: dict[str, Any]) -> Recording:
         a descriptor (D,); other keys go to it too. Or a class: they make an object, which is
         called with the points.
     """
-    return described(Experiment(config).replaced(recording=None).recording(), _by_network(network))
+    return describe_clouds(
+        Experiment(config).replace(recording=None).recording(), _by_network(network)
+    )
 
 
 def _by_network(settings: dict[str, Any]) -> Callable[[Lidar3D, Floats], Floats]:

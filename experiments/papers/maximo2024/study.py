@@ -17,7 +17,7 @@ from experiments.bench import topological
 from experiments.judging.jobs import Progress, Tables, tables_of
 from experiments.judging.results import Arrays, Profile, Results
 from experiments.papers.maximo2024.claims import headlines
-from experiments.papers.maximo2024.places import oxford_runs, resequenced
+from experiments.papers.maximo2024.places import oxford_runs, resequence
 from experiments.papers.maximo2024.settings import (
     CONTROLS,
     DRAWN_DESCRIPTOR,
@@ -48,11 +48,11 @@ from experiments.papers.maximo2024.worlds import (
     Rows,
     campus_rows,
     campus_runs,
-    case_of,
     cluster_labels,
     cluster_row,
     kidnapping_rows,
     localize,
+    make_case,
     options,
     particle_rows,
     quality_rows,
@@ -87,7 +87,7 @@ def run(profile: Profile, out: Results, on_progress: Progress) -> None:
     tables["table_1"] = table_1(tables["weighting"])
     tables["table_2"] = table_2(tables["particles"], tables["times"])
     drawn = {
-        name: route_arrays(case_of(name, JUDGED_SEED), N_REPEATS[profile]) for name in routes()
+        name: route_arrays(make_case(name, JUDGED_SEED), N_REPEATS[profile]) for name in routes()
     }
     tables["figure_5"] = figure_5(drawn)
     out.write_tables(**tables)
@@ -135,7 +135,7 @@ def _rows(what: str, name: str, seed: int, profile: Profile) -> dict[str, Rows]:
     if what == "runs":
         names, n_fewer = oxford_runs(POSITIONS), max(n_repeats // 5, 1)
         return {"runs": [{"run": n, **row} for n in names for row in run_rows(n, seed, n_fewer)]}
-    case = case_of(name, seed)
+    case = make_case(name, seed)
     if what in ("weighting", "control"):
         return weighting_rows(case, n_repeats)
     settings, tolerance_m = options(case), TOLERANCE * case.known_map.spacing_m
@@ -155,7 +155,7 @@ def times(n_repeats: int) -> pd.DataFrame:
     """Table 2: time per node on one core, timed repeatedly after the other jobs have ended."""
     rows = []
     for name in sorted(headlines(routes())):
-        experiment = case_of(name, JUDGED_SEED).experiment
+        experiment = make_case(name, JUDGED_SEED).experiment
         for count, paper_s in topological.PAPER_S[name.removesuffix("_real")].items():
             found = [topological.node_s(experiment, count) for _ in range(n_repeats)]
             rows += [(name, count, repeat, time_s, paper_s) for repeat, time_s in enumerate(found)]
@@ -226,7 +226,7 @@ def route_arrays(case: Case, n_repeats: int) -> Arrays:
     n = len(case.recording.frame_stamps)
     errors = np.full((3, n), np.nan)
     for i, start in enumerate((0, n // 4, n // 2)):
-        part = resequenced(case.recording, np.arange(start, n))
+        part = resequence(case.recording, np.arange(start, n))
         rngs = [stream(case.seed, f"estimator/figure_5/{start}", k) for k in range(n_repeats)]
         walks = [localize(case, options(case), rng, part).errors_m for rng in rngs]
         errors[i, start:] = np.mean(walks, axis=0)
@@ -306,7 +306,7 @@ def tune(out: Results, n_worlds: int = 8) -> None:
 
 
 def _tuning_rows(name: str, seed: int) -> Tables:
-    case, rows = case_of(name, seed), []
+    case, rows = make_case(name, seed), []
     for sigma_l, sigma_m, n_nearest in itertools.product(GRID_SIGMA_L, GRID_SIGMA_M, GRID_B):
         settings = options(case, "M2", (sigma_l, sigma_m, n_nearest))
         walk = localize(case, settings, stream(seed, "estimator/tuning"))

@@ -18,7 +18,13 @@ from estimators.topological import descriptors as describers
 from estimators.topological.topological_map import TopologicalMap, from_recording
 from experiments.evaluation.metrics import position_errors_m, rms, travelled_m
 from experiments.judging.results import Profile
-from experiments.papers.maximo2024.places import N_STRETCHES, UMH, described, gaps_m, resequenced
+from experiments.papers.maximo2024.places import (
+    N_STRETCHES,
+    UMH,
+    describe_clouds,
+    gaps_m,
+    resequence,
+)
 from experiments.papers.maximo2024.settings import (
     CAMPUS_SHIFT_M,
     GRID_B,
@@ -66,7 +72,7 @@ class Case:
     recording: Recording
 
 
-def case_of(name: str, seed: int, *overrides: str) -> Case:
+def make_case(name: str, seed: int, *overrides: str) -> Case:
     """World of a route; `oxford_real` has the real positions, `_plane` queries off the route."""
     route, _, kind = name.partition("_")
     lines = [f"study=maximo2024/{route}", f"seed={seed}", *overrides]
@@ -140,7 +146,7 @@ def localize(
     return Walk(errors, np.array(estimate.extras["dispersion_m"]), estimate)
 
 
-def settled_at(errors_m: Array, tolerance_m: float) -> float:
+def settling_step(errors_m: Array, tolerance_m: float) -> float:
     """First step from which the error stays within the tolerance for `HELD` steps, or NaN."""
     if len(errors_m) < HELD:
         return math.nan
@@ -177,7 +183,7 @@ def _nearest_node_m(case: Case) -> float:
 
 def run_rows(positions_run: str, seed: int, n_repeats: int) -> Iterator[Row]:
     """Table 1 on the positions of any Oxford run."""
-    case = case_of("oxford_real", seed, f"positions_run={positions_run}")
+    case = make_case("oxford_real", seed, f"positions_run={positions_run}")
     label = {"nodes": len(case.known_map), "nearest_node_m": _nearest_node_m(case)}
     for method in METHODS:
         walks = _repeated(case, options(case, method), "estimator/topological_mcl", n_repeats)
@@ -215,9 +221,9 @@ def starts(
     """Figure 5: starts all along the route, the step at which each is localized, and its run."""
     length = WITHIN + HELD
     for start in map(int, np.linspace(0, len(case.recording.frame_stamps) - length - 1, n_starts)):
-        part = resequenced(case.recording, np.arange(start, start + length))
+        part = resequence(case.recording, np.arange(start, start + length))
         walk = localize(case, settings, stream(case.seed, "estimator/starts", start), part)
-        yield start, settled_at(walk.errors_m, tolerance_m), walk
+        yield start, settling_step(walk.errors_m, tolerance_m), walk
 
 
 def kidnapping_rows(
@@ -240,7 +246,7 @@ def kidnapping_rows(
     for trial in range(n_trials):
         before = np.arange(KIDNAPPED_AFTER) + draws.integers(0, n // 2 - 40)
         there = np.arange(n_after) + draws.integers(n // 2, n - n_after)
-        part = resequenced(case.recording, np.concatenate([before, there]))
+        part = resequence(case.recording, np.concatenate([before, there]))
         for share in (0.0, injection):
             rng = stream(case.seed, "estimator/kidnapping", trial)
             errors = localize(case, settings | {"injection": share}, rng, part).errors_m
@@ -248,14 +254,15 @@ def kidnapping_rows(
                 "trial": trial,
                 "injection": share,
                 "known_before": bool(errors[KIDNAPPED_AFTER - 1] <= tolerance_m),
-                "settled_at": settled_at(errors[KIDNAPPED_AFTER:], tolerance_m) / queries_per_node,
+                "settled_at": settling_step(errors[KIDNAPPED_AFTER:], tolerance_m)
+                / queries_per_node,
             }
 
 
 def quality_rows(name: str, seed: int) -> Iterator[Row]:
     """Map of M1-M3 over the descriptors' noise and B, all else as in `weighting_rows`."""
     for noise in QUALITIES:
-        case = case_of(name, seed, f"recording.noise_weight={noise}")
+        case = make_case(name, seed, f"recording.noise_weight={noise}")
         recall = _retrieval(case.known_map, case.recording)["recall_at_1"]
         part = case.recording.cut(QUALITY_STEPS)
         for n_nearest, method in itertools.product(GRID_B, METHODS):
@@ -315,7 +322,7 @@ def campus_runs(seed: int) -> tuple[Experiment, Experiment]:
     along[[0, -1]] = way[1] - way[-2]  # the tour is closed
     left = along[:, ::-1] * [-1.0, 1.0] / np.hypot(*along.T)[:, None]
     route = {**mapping.options_of("route"), "waypoints": (way + CAMPUS_SHIFT_M * left).tolist()}
-    return mapping, mapping.replaced(seed=seed + 500, route=route)  # the same world_seed
+    return mapping, mapping.replace(seed=seed + 500, route=route)  # the same world_seed
 
 
 def campus_rows(seed: int, profile: Profile, *, with_clusters: bool) -> dict[str, Rows]:
@@ -333,11 +340,11 @@ def campus_rows(seed: int, profile: Profile, *, with_clusters: bool) -> dict[str
     for descriptor in describers.KINDS if with_clusters else ():
         known = from_recording(mapped, descriptor, settings["spacing_m"])
         fine = from_recording(mapped, descriptor, UMH.spacing_m)
-        queries = described(taken, describers.kind(descriptor).describe)
+        queries = describe_clouds(taken, describers.kind(descriptor).describe)
         row = cluster_row(fine, queries, descriptor, seed)
         tables["clusters"].append({**row, **_retrieval(known, queries)})
     known = from_recording(mapped, settings["descriptor"], settings["spacing_m"])
-    queries = described(taken, describers.kind(settings["descriptor"]).describe)
+    queries = describe_clouds(taken, describers.kind(settings["descriptor"]).describe)
     case = Case("campus", seed, taking, known, queries)
     per_node = float(known.spacing_m / np.median(np.abs(np.diff(taken.wheels.position_m[:, 0]))))
     places = {"place": case.recording.log("place")}  # without the clouds
@@ -356,8 +363,8 @@ def _one_query_a_node(case: Case) -> Case:
     gone = travelled_m(case.recording.truth_at(case.recording.frame_stamps))
     rows = np.unique(np.searchsorted(gone, np.arange(0.0, gone[-1], case.known_map.spacing_m)))
     printed = Experiment.compose(["estimator=topological_mcl_paper"])
-    experiment = case.experiment.replaced(estimator=printed.options_of("estimator"))
-    return replace(case, experiment=experiment, recording=resequenced(case.recording, rows))
+    experiment = case.experiment.replace(estimator=printed.options_of("estimator"))
+    return replace(case, experiment=experiment, recording=resequence(case.recording, rows))
 
 
 def _campus_starts(case: Case, n_starts: int) -> Iterator[Row]:

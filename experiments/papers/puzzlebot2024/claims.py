@@ -15,10 +15,10 @@ from experiments.judging.claim import (
     Role,
     Subject,
     Verdict,
-    banded,
     beside,
     holds,
-    judged,
+    judge_bounds,
+    judge_interval,
     more_to_settle,
     overall,
     shown,
@@ -93,7 +93,7 @@ def pb2(areas: pd.DataFrame, crossover: pd.DataFrame, track_m: float) -> Iterato
             yield Claim(about, statistic, found, "0", holds(shrinking <= 0.0))
     ratio = mean_interval(crossover["crossover_m"] / (track_m * math.sqrt(3.0) / 2.0))
     statistic = "distance at which heading-borne spread overtakes, over track sqrt(3) / 2"
-    yield banded(Subject("PB2", "crossover"), statistic, ratio, 0.98, 1.02, n=len(crossover))
+    yield judge_bounds(Subject("PB2", "crossover"), statistic, ratio, 0.98, 1.02, n=len(crossover))
 
 
 def pb3(
@@ -120,14 +120,16 @@ def pb3(
             share = _clustered_share(part["truth"].between(part["low"], part["high"]), part["seed"])
             label = f"coverage of the 95 % intervals of {names}: {where}"
             covered = dataclasses.replace(about, quantity="coverage", metric=names)
-            claim = banded(covered, label, share, 0.90, 0.99, n=n)
+            claim = judge_bounds(covered, label, share, 0.90, 0.99, n=n)
             yield beside(claim, is_beside or names != "kr and kl")
         relative = slips["value"] / slips["truth"] - 1.0
         biases = [mean_interval(part) for _, part in relative.groupby(slips["parameter"])]
         worse = max(biases, key=lambda bias: abs(bias.value))
         label = f"relative bias, the worse of kr and kl: {where}"
-        verdict = overall([judged(bias, -0.05, 0.05) for bias in biases])
-        claim = dataclasses.replace(banded(about, label, worse, -0.05, 0.05, n=n), verdict=verdict)
+        verdict = overall([judge_interval(bias, -0.05, 0.05) for bias in biases])
+        claim = dataclasses.replace(
+            judge_bounds(about, label, worse, -0.05, 0.05, n=n), verdict=verdict
+        )
         yield beside(claim, is_beside)
     for row in engine_k.itertuples():
         label = (
@@ -135,7 +137,7 @@ def pb3(
         )
         ratio = Interval(row.value / row.truth, row.low / row.truth, row.high / row.truth)
         about = Subject("PB3", "k of PyBullet's robot", setting=row.k_m, metric=row.parameter)
-        yield beside(banded(about, label, ratio, 0.95, 1.05))
+        yield beside(judge_bounds(about, label, ratio, 0.95, 1.05))
     limits = np.abs(descent["k_in_the_end"] - 0.5)
     what = "the report's gradient descent: largest distance of its limit from 1/2, any data"
     judgement = ("above 0.01: it depends on the data", holds(float(limits.max()) > 0.01))
@@ -159,7 +161,7 @@ def pb3_short_turns(ends: pd.DataFrame, found: pd.DataFrame) -> Iterator[Claim]:
     row = found.set_index("parameter").loc["track_m"]
     ratio = Interval(*(float(row[name] / row["truth"]) for name in ("value", "low", "high")))
     what = f"track over the true one, {where}, gains and track by sampled end poses"
-    yield beside(banded(Subject("PB3", "track"), what, ratio, 0.98, 1.02))
+    yield beside(judge_bounds(Subject("PB3", "track"), what, ratio, 0.98, 1.02))
 
 
 def pb4(coverage: pd.DataFrame, engine: pd.DataFrame, cases: pd.DataFrame) -> Iterator[Claim]:
@@ -180,7 +182,7 @@ def pb4(coverage: pd.DataFrame, engine: pd.DataFrame, cases: pd.DataFrame) -> It
         runs = [int(n) for n in table["runs"]]
         shares = [share_interval(int(row.in_ellipse), int(row.runs)) for row in table.itertuples()]
         worst = int(np.argmin([share.value for share in shares]))
-        parts = [judged(share, *_BAND) for share in shares]
+        parts = [judge_interval(share, *_BAND) for share in shares]
         more = [more_to_settle(share, n, *_BAND) for share, n in zip(shares, runs, strict=True)]
         case = table.iloc[worst]["case"]
         n_within = f"{parts.count(Verdict.REPRODUCED)} of {len(parts)}"
@@ -198,7 +200,7 @@ def pb4(coverage: pd.DataFrame, engine: pd.DataFrame, cases: pd.DataFrame) -> It
         left += [k] if claim.verdict is Verdict.NOT_REPRODUCED else []
     label = "distance of PyBullet's end from the kinematic robot's, same noise, over the spread"
     gap = mean_interval(_engine_gap(engine))
-    yield beside(banded(Subject("PB4", "engine"), label, gap, at_most=0.05))
+    yield beside(judge_bounds(Subject("PB4", "engine"), label, gap, at_most=0.05))
     if left:
         what = "least k at which a manoeuvre leaves the band, m"
         yield shown(Subject("PB4", "limit"), what, Interval.exact(left[0]))

@@ -41,7 +41,7 @@ from experiments.runs.evaluate import run_over
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Row
 from experiments.runs.seeds import stream
-from experiments.sweeps.plan import planned
+from experiments.sweeps.plan import plan_experiments
 from sim.arrays import Array
 from sim.recording import Recording, WheelLog
 from sim.robot.drive import DifferentialDrive, RobotGeometry
@@ -109,7 +109,7 @@ class Arm:
 
 def arms(study: str) -> list[Arm]:
     """All robots of a study, each with all manoeuvres."""
-    runs = planned([f"study=puzzlebot2024/{study}"])
+    runs = plan_experiments([f"study=puzzlebot2024/{study}"])
     return [
         Arm(seed, robot, {part.choices["route"]: part.route() for part in parts})
         for (seed, robot), parts in itertools.groupby(runs, lambda run: (run.seed, run.robot()))
@@ -154,7 +154,7 @@ def crossover(*overrides: str) -> pd.DataFrame:
     the heading. The encoders are noisy, so each run gives its own distance.
     """
     rows = []
-    for experiment in planned(["study=puzzlebot2024/crossover", *overrides]):
+    for experiment in plan_experiments(["study=puzzlebot2024/crossover", *overrides]):
         robot = experiment.robot()
         batch = run_batch(robot, experiment.route(), 1, stream(experiment.seed, "slip"))
         believed = dead_reckoning(batch, robot.kr, robot.kl)
@@ -214,7 +214,7 @@ def square_feedback(*overrides: str) -> tuple[pd.DataFrame, dict[str, NDArray[np
     """
     rows: list[Row] = []
     paths: dict[str, list[Array]] = {"true_m": [], "believed_m": []}
-    for experiment in planned(["study=puzzlebot2024/square_feedback", *overrides]):
+    for experiment in plan_experiments(["study=puzzlebot2024/square_feedback", *overrides]):
         route, recording = experiment.route(), experiment.simulate()
         prior, rng = experiment.prior(recording), np.random.default_rng(0)
         online, _ = run_over(recording, experiment.estimator(), prior, rng)
@@ -407,7 +407,7 @@ def engine_recordings(*overrides: str) -> Driven:
     for physics in ("bullet", "kinematic"):
         study = ["study=puzzlebot2024/engine", f"simulation.physics={physics}", *overrides]
         cases: dict[str, int] = {}
-        for run in planned(study):
+        for run in plan_experiments(study):
             case = run.choices["route"]
             i = cases.setdefault(case, len(cases))
             streams = {axis: stream(run.seed, axis, i) for axis in ("slip", "sensors")}

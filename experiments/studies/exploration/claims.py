@@ -10,7 +10,7 @@ from collections.abc import Iterator
 import pandas as pd
 
 from experiments.evaluation.statistics import log_ratio_interval, share_interval
-from experiments.judging.claim import Claim, Subject, banded, beside, lower, shown
+from experiments.judging.claim import Claim, Subject, beside, judge_bounds, judge_lower, shown
 from experiments.judging.results import Results
 from experiments.studies.exploration.settings import (
     AFTER_M,
@@ -43,13 +43,13 @@ def gi10(runs: pd.DataFrame) -> Iterator[Claim]:
     seen = f"area seen after {AFTER_M:g} m a robot"
     for other in NAMES:
         if other != JUDGED:
-            found = lower(*subject(seen, other, JUDGED), area[other], area[JUDGED])
+            found = judge_lower(*subject(seen, other, JUDGED), area[other], area[JUDGED])
             yield beside(found, other != BASE)
     for shared, own in ((SHARED, BASE), (JUDGED, GAIN)):
         yield shown(*subject(seen, shared, own), log_ratio_interval(area[shared], area[own]))
     ratio = log_ratio_interval(chart[JUDGED], chart[BASE])
     about = subject("error of FastSLAM's map", JUDGED, BASE)
-    yield banded(*about, ratio, at_most=MARGIN, n=len(chart))
+    yield judge_bounds(*about, ratio, at_most=MARGIN, n=len(chart))
     by_strategy = runs.groupby("strategy")
     n_robots, stopped = N_ROBOTS * by_strategy["seed"].count(), by_strategy["stopped"].sum()
     for strategy in (BASE, JUDGED):

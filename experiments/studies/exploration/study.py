@@ -23,7 +23,7 @@ from sim import se2
 from sim.arrays import Array
 from sim.sensors.laser import Laser
 from sim.team import Team
-from sim.worlds.grid import rasterized
+from sim.worlds.grid import rasterize
 from sim.worlds.grid_mapping import ScanGrid
 
 _EVERY_S = 1.0  # the area is counted
@@ -45,7 +45,7 @@ def run(profile: Profile, out: Results, on_progress: Progress) -> None:
     ]
     out.write_tables(**tables_of(tables_from, jobs, on_progress))
     for strategy in (settings.BASE, settings.JUDGED):
-        team = composed(settings.FIRST_SEED, strategy).recordings()
+        team = compose_experiment(settings.FIRST_SEED, strategy).recordings()
         out.write_arrays(f"drive_{strategy}", **drive_of(team.robots, settings.AFTER_M))
 
 
@@ -54,7 +54,7 @@ def tables_from(seed: int, strategy: str) -> Tables:
 
     The map is that of the paper's method, run over the drive.
     """
-    experiment = composed(seed, strategy)
+    experiment = compose_experiment(seed, strategy)
     team = experiment.recordings()
     driven_m, area_m2 = coverage(team, settings.RESOLUTION_M)
     labels: Row = {"seed": seed, "strategy": strategy}
@@ -72,7 +72,7 @@ def tables_from(seed: int, strategy: str) -> Tables:
     return {"runs": [row], "coverage": curve}
 
 
-def composed(seed: int, strategy: str) -> Experiment:
+def compose_experiment(seed: int, strategy: str) -> Experiment:
     """The experiment of one strategy in one world."""
     return Experiment.compose(["study=exploration", f"seed={seed}", f"route.strategy={strategy}"])
 
@@ -88,7 +88,7 @@ def coverage(team: Team, resolution_m: float) -> tuple[Array, Array]:
     low, high = ends.min(axis=0) - reach_m, ends.max(axis=0) + reach_m
     grid = ScanGrid.over(low, high, resolution_m)
     every = np.argwhere(grid.last_scan == 0)
-    reached = rasterized(world, resolution_m, laser.mount.z_m).at(grid.middles_m(every))
+    reached = rasterize(world, resolution_m, laser.mount.z_m).at(grid.middles_m(every))
     floor = (reached == 0.0).reshape(grid.last_scan.shape)
     until_s = max(robot.frame_stamps[-1] for robot in team.robots)
     stamps = np.arange(0.0, until_s + _EVERY_S, _EVERY_S)

@@ -8,13 +8,13 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from experiments.evaluation.metrics import nees_at_distances
-from experiments.judging.jobs import Progress, Tables, grouped, tables_of
+from experiments.judging.jobs import Progress, Tables, group_by, tables_of
 from experiments.judging.results import Profile, Results
 from experiments.runs.evaluate import run_over
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Row
 from experiments.runs.seeds import stream
-from experiments.sweeps.plan import planned
+from experiments.sweeps.plan import plan_experiments
 
 DISTANCES_M = (10.0, 20.0, 30.0, 40.0, 50.0, 60.0, 70.0, 80.0, 90.0)
 MAX_QUICK = 1000  # particles
@@ -28,15 +28,15 @@ def run(profile: Profile, out: Results, on_progress: Progress) -> None:
     profile
         `quick`: up to 1000 particles in four worlds; `full`: up to 10,000 in twenty.
     """
-    jobs = [[part] for part in grouped(plan(profile), lambda one: one.seed)]
+    jobs = [[part] for part in group_by(plan(profile), lambda one: one.seed)]
     out.write_tables(**tables_of(rows_of, jobs, on_progress))
 
 
 def plan(profile: Profile) -> Iterator[Experiment]:
     """All runs, or those of the quick profile."""
     if profile is Profile.FULL:
-        return planned(["study=fastslam_consistency"])
-    runs = planned(["study=fastslam_consistency", "seed=range(1000,1004)"])
+        return plan_experiments(["study=fastslam_consistency"])
+    runs = plan_experiments(["study=fastslam_consistency", "seed=range(1000,1004)"])
     return (one for one in runs if one.option("n_particles", 0) <= MAX_QUICK)
 
 

@@ -21,7 +21,7 @@ from experiments.runs.experiment import Experiment
 from experiments.runs.row import Row
 from experiments.runs.seeds import stream
 from experiments.studies.mcl_office.settings import FOR_M, NEAR_M, NEAR_RAD, WITHIN_M
-from experiments.sweeps.plan import planned
+from experiments.sweeps.plan import plan_experiments
 from sim.arrays import Array
 from sim.recording import Recording
 
@@ -35,7 +35,7 @@ def run(profile: Profile, out: Results, on_progress: Progress) -> None:
         `quick`: 3 starts in each of 4 offices; `full`: 20 in each of 10.
     """
     n_starts, fewer = (20, []) if profile is Profile.FULL else (3, ["seed=range(1000,1004)"])
-    jobs = [(office, n_starts) for office in planned(["study=mcl_office", *fewer])]
+    jobs = [(office, n_starts) for office in plan_experiments(["study=mcl_office", *fewer])]
     made = tables_of(starts, jobs, on_progress)
     out.write_tables(**made, share=localised_share(made["starts"]))
 

@@ -9,12 +9,12 @@ import pandas as pd
 
 from estimators.peers import MissingPackageError
 from experiments.evaluation.statistics import log_ratio_interval
-from experiments.judging.jobs import Progress, Tables, answer_of, grouped, tables_of
+from experiments.judging.jobs import Progress, Tables, answer_of, group_by, tables_of
 from experiments.judging.results import Profile, Results
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Outcome, Row
 from experiments.studies.peers.settings import LASER, PACKAGES, READS, TUNED
-from experiments.sweeps.plan import planned
+from experiments.sweeps.plan import plan_experiments
 from experiments.sweeps.tune import FAILED_M
 
 _ERROR = "answer_ate_rmse_m"
@@ -30,13 +30,13 @@ def run(profile: Profile, out: Results, on_progress: Progress) -> None:
         `quick`: one recording of each world; `full`: five.
     """
     fewer = [] if profile is Profile.FULL else ["seed=1000"]
-    experiments = list(planned(["study=peers", *fewer]))
+    experiments = list(plan_experiments(["study=peers", *fewer]))
     one_each = {experiment.estimator_name: experiment for experiment in experiments}
     absent = {name: why for name, experiment in one_each.items() if (why := missing(experiment))}
     for name, reason in absent.items():
         print(f"{name}: left out, {reason}", file=sys.stderr)
     present = [e for e in experiments if e.estimator_name not in absent]
-    drives = grouped(present, lambda e: (e.choices["world"], e.seed))
+    drives = group_by(present, lambda e: (e.choices["world"], e.seed))
     made = tables_of(runs, [(drive,) for drive in drives], on_progress)
     out.write_tables(**made, methods=methods(made["runs"]))
     if absent:

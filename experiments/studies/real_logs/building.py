@@ -19,14 +19,14 @@ from estimators.base import Estimate
 from estimators.graph.graph_slam import GraphSlam
 from estimators.odometry import Odometry
 from experiments.evaluation.relations import relation_errors
-from experiments.evaluation.time_sync import nearest
+from experiments.evaluation.time_sync import nearest_rows
 from experiments.judging.logs import (
     GRAPHS,
     freiburg,
     intel,
     intel_known_stamps,
     relations_of,
-    tracked,
+    track,
 )
 from experiments.runs.row import Row
 from experiments.studies.real_logs.settings import KUEMMERLE, RESOLUTION_M
@@ -79,7 +79,7 @@ def scored(
     scans, graph = recording.log("laser").stamps, carmen.read_carmen(GRAPHS[name])
     known = scans if known_stamps is None else known_stamps
     judged = _shared(relations_of(name), known, graph.scan_stamps)
-    online, revised = tracked(GraphSlam(**_OPTIONS | options), recording)
+    online, revised = track(GraphSlam(**_OPTIONS | options), recording)
     assert revised is not None
     at_scans = np.searchsorted(online.stamps, scans)
     rows: list[Row] = [
@@ -104,7 +104,7 @@ def _shared(relations: Relations, *stamps: Array) -> Relations:
     """Relations between two different ones of each of these stamps (T,), s, or near them."""
     kept = np.ones(len(relations.stamps), dtype=bool)
     for known in stamps:
-        rows = nearest(known, relations.stamps)
+        rows = nearest_rows(known, relations.stamps)
         near = np.abs(known[rows] - relations.stamps) <= _TOLERANCE_S
         kept &= near.all(axis=1) & (rows[:, 0] != rows[:, 1])
     return Relations(relations.stamps[kept], relations.motion[kept])
@@ -114,7 +114,7 @@ def closed_loops() -> tuple[pd.DataFrame, dict[str, NDArray[Any]]]:
     """Errors on all logs, and grids of Intel by its edges alone and with its loops closed."""
     edges = carmen.to_recording(carmen.read_carmen(GRAPHS["intel"]))
     rows, after = scored("intel", "SEQUENTIAL edges", edges)
-    before, _ = tracked(Odometry(kr=_OPTIONS["kr"], kl=_OPTIONS["kl"]), edges)
+    before, _ = track(Odometry(kr=_OPTIONS["kr"], kl=_OPTIONS["kl"]), edges)
     rows += scored("fr079", "SEQUENTIAL edges", freiburg())[0]
     wheels, logged = intel("calibrated"), intel("logged")
     mounts = [one.sensor("laser", Laser).mount.pose for one in (wheels, logged)]

@@ -12,11 +12,11 @@ from experiments.judging.claim import (
     Claim,
     Subject,
     Verdict,
-    banded,
     beside,
     holds,
-    remarked,
+    judge_bounds,
     shown,
+    with_remark,
 )
 from experiments.judging.results import Results
 from experiments.studies.real_logs.settings import (
@@ -75,10 +75,10 @@ def _difference(about: Subject, fused: pd.Series[float], rival: pd.Series[float]
         f"{about.place}"
     )
     minutes = int(rival["difference_minutes"])
-    claim = banded(about, label, found, at_most=0.0, criterion="below 0", n=minutes)
+    claim = judge_bounds(about, label, found, at_most=0.0, criterion="below 0", n=minutes)
     ours_m, other_m = float(fused.translation_mean_m), float(rival.translation_mean_m)
     remark = f"fusion {ours_m:.3f} m, the other {other_m:.3f} m"
-    return remarked(claim, remark, fused_m=ours_m, other_m=other_m)
+    return with_remark(claim, remark, fused_m=ours_m, other_m=other_m)
 
 
 def rl3(mrclam: pd.DataFrame) -> Iterator[Claim]:

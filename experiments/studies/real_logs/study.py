@@ -27,7 +27,7 @@ from experiments.judging.logs import (
     GRAPHS,
     known_start,
     relations_of,
-    tracked,
+    track,
     tuned_until_s,
 )
 from experiments.judging.results import Profile, Results
@@ -55,7 +55,7 @@ from experiments.studies.real_logs.settings import (
     TUNED_ROBOTS,
     WEAN_LOGS,
 )
-from experiments.sweeps.plan import planned
+from experiments.sweeps.plan import plan_experiments
 from sim import se2
 from sim.arrays import Array
 from sim.formats import carmen, lego, rawseeds, wean
@@ -129,14 +129,14 @@ def rawseeds_ate() -> pd.DataFrame:
 def intel_relations() -> tuple[list[Row], Paths]:
     """The relations metric of our estimates and of the references on the Intel log; and paths."""
     truth = relations_of("intel")
-    runs = dict(zip(INTEL, planned(["study=real_logs/intel"]), strict=True))
+    runs = dict(zip(INTEL, plan_experiments(["study=real_logs/intel"]), strict=True))
     by_recording = {run.recording_key: run for run in runs.values()}
     recordings = {key: run.recording() for key, run in by_recording.items()}
     sparse, logged = (recordings[runs[name].recording_key] for name in INTEL[:2])
     until_s = tuned_until_s(logged)
     found: dict[str, tuple[Array, Array]] = {}
     for name, run in runs.items():
-        estimate, _ = tracked(run.estimator(), recordings[run.recording_key])
+        estimate, _ = track(run.estimator(), recordings[run.recording_key])
         found[name] = estimate.stamps, estimate.means
     found[GMAPPING] = sparse.known_truth.stamps, sparse.known_truth.poses
     graph = carmen.read_carmen(GRAPHS["intel"])
@@ -154,8 +154,8 @@ def intel_relations() -> tuple[list[Row], Paths]:
 def freiburg_relations() -> Iterator[Row]:
     """The relations metric of our estimates and of the graph on the log of Freiburg 079."""
     truth = relations_of("fr079")
-    for name, run in zip(FREIBURG, planned(["study=real_logs/fr079"]), strict=True):
-        found, _ = tracked(run.estimator(), run.recording())
+    for name, run in zip(FREIBURG, plan_experiments(["study=real_logs/fr079"]), strict=True):
+        found, _ = track(run.estimator(), run.recording())
         yield from _relation_rows("fr079", name, truth, found.stamps, found.means)
     log = carmen.read_carmen(GRAPHS["fr079"])
     for name, near in (("graph (FLIRT)", False), ("graph (FLIRT), exact stamps", True)):
@@ -220,7 +220,7 @@ def landmark_slam(profile: Profile, on_progress: Progress) -> tuple[pd.DataFrame
     """Errors of dead reckoning, FastSLAM and EKF-SLAM against motion capture; and some paths."""
     study = "study=real_logs/mrclam"
     runs = {
-        robot: dict(zip(MRCLAM, planned([study, f"recording.robot={robot}"]), strict=True))
+        robot: dict(zip(MRCLAM, plan_experiments([study, f"recording.robot={robot}"]), strict=True))
         for robot in MRCLAM_ROBOTS[profile]
     }
     ekf = int(profile is Profile.FULL)
@@ -321,11 +321,11 @@ def wean_fit(logs: str) -> tuple[pd.DataFrame, dict[str, NDArray[Any]]]:
     grid = wean.read_grid(DATA / "wean_hall_mcl" / "wean.dat.gz")
     rows = []
     drawn: dict[str, NDArray[Any]] = {}
-    studies = planned(["study=real_logs/wean", f"recording.number={logs}"])
+    studies = plan_experiments(["study=real_logs/wean", f"recording.number={logs}"])
     for number, run in zip(logs.split(","), studies, strict=True):
         recording = run.recording()
         laser, scans = recording.sensor("laser", Laser), recording.log("laser")
-        estimate, _ = tracked(run.estimator(), recording)
+        estimate, _ = track(run.estimator(), recording)
         poses = estimate.means[np.searchsorted(estimate.stamps, scans.stamps)]
         travelled = travelled_m(poses)
         chosen = np.searchsorted(travelled, np.arange(0.0, min(travelled[-1], 15.0), 0.5))

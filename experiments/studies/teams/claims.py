@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import pandas as pd
 
 from experiments.evaluation.statistics import log_ratio_interval
-from experiments.judging.claim import Claim, Subject, beside, lower, shown
+from experiments.judging.claim import Claim, Subject, beside, judge_lower, shown
 from experiments.judging.results import Results
 from experiments.studies.teams.settings import ALWAYS, MRCLAM_ARMS
 
@@ -29,7 +29,7 @@ def gi9(errors: pd.DataFrame) -> Iterator[Claim]:
         wide = part.pivot_table(index="seed", columns="sightings", values=_ERROR).dropna()
         words = f"error with sightings over without, {size} robots: {NAMES[name]}"
         about = Subject("GI9", "sightings", method=str(name), size=int(size))
-        yield beside(lower(about, words, wide[True], wide[False]), name != "fastslam")
+        yield beside(judge_lower(about, words, wide[True], wide[False]), name != "fastslam")
     own = errors[(errors["filter"] == "ekf_slam") & errors["sightings"]]
     for (link, size), part in own[own["link"] != ALWAYS].groupby(["link", "size"], sort=False):
         both = pd.concat([part, linked[(linked["size"] == size) & linked["sightings"]]])

@@ -20,7 +20,7 @@ from estimators.landmarks.ekf_slam import EkfSlam
 from estimators.team import Communication, run_team
 from experiments.evaluation.metrics import score
 from experiments.judging.jobs import Progress, Tables, answer_of, tables_of
-from experiments.judging.logs import CALIBRATED_S, MRCLAM_6, calibration_by_truth, known_start
+from experiments.judging.logs import CALIBRATED_S, MRCLAM_6, calibrate_by_truth, known_start
 from experiments.judging.results import Profile, Results
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Row
@@ -66,11 +66,11 @@ def run(profile: Profile, out: Results, on_progress: Progress) -> None:
 def rows_of(seed: int, option: str) -> Tables:
     """Rows of an estimator's runs in one world, for each size of the team."""
     rows: list[Row] = []
-    whole = composed(seed, {}).recordings()
+    whole = compose_experiment(seed, {}).recordings()
     for size in settings.SIZES:
         team = functools.partial(whole.first, size)
         for overrides, labels in _arms(size, option):
-            found = answer_of(composed(seed, overrides), _KEPT, team)
+            found = answer_of(compose_experiment(seed, overrides), _KEPT, team)
             shared = {"seed": seed, "size": size, "filter": option, **labels}
             rows.append(shared | {_KEPT[name]: value for name, value in found.items()})
     return {"errors": rows}
@@ -89,7 +89,7 @@ def _arms(size: int, option: str) -> Iterator[tuple[dict[str, Any], Row]]:
             yield base | link, {"sightings": True, "link": kind}
 
 
-def composed(seed: int, overrides: Mapping[str, Any]) -> Experiment:
+def compose_experiment(seed: int, overrides: Mapping[str, Any]) -> Experiment:
     """The experiment of one arm in one world."""
     given = [f"{key}={value}" for key, value in overrides.items()]
     return Experiment.compose(["study=teams", f"seed={seed}", *given])
@@ -97,7 +97,7 @@ def composed(seed: int, overrides: Mapping[str, Any]) -> Experiment:
 
 def drive(seed: int) -> dict[str, Array]:
     """True paths of a team, and its sightings as lines, for the figure."""
-    robots = composed(seed, {}).recordings().robots
+    robots = compose_experiment(seed, {}).recordings().robots
     lines = (sightings(robots, number)[1] for number in range(len(robots)))
     seen = {f"sightings_{number}": each.reshape(-1, 4) for number, each in enumerate(lines)}
     return drive_of(robots) | seen
@@ -133,9 +133,9 @@ def _calibrated(recording: Recording) -> Recording:
 
     One camera sees landmarks and robots, so the calibration by landmarks is that of sightings too.
     """
-    found = calibration_by_truth(recording)
+    found = calibrate_by_truth(recording)
     eyes = dict.fromkeys(("stereo", "robots"), found.sensors["stereo"])
-    own = dataclasses.replace(found, sensors=eyes).applied(recording)
+    own = dataclasses.replace(found, sensors=eyes).apply(recording)
     for name in eyes:
         camera: Any = own.sensors[name]
         log = own.log(name)

@@ -7,7 +7,7 @@ import pandas as pd
 from scipy import stats
 
 from experiments.evaluation.statistics import Interval, mean_interval, share_interval
-from experiments.judging.claim import Claim, Subject, banded, holds, shown
+from experiments.judging.claim import Claim, Subject, holds, judge_bounds, shown
 from experiments.judging.results import Results
 from experiments.studies.twins.settings import LEAST_SHARE, SHOWN
 
@@ -67,7 +67,7 @@ def tw2(pairs: pd.DataFrame) -> Iterator[Claim]:
     judged = [tau for log, tau in taus.items() if log not in SHOWN and np.isfinite(tau)]
     mean = mean_interval(judged)
     low, high = np.clip([mean.low, mean.high], -1.0, 1.0)  # between which every tau lies
-    yield banded(
+    yield judge_bounds(
         Subject("TW2", "tau"),
         "Kendall's tau of predicted medians and real errors over estimators, mean over logs",
         Interval(mean.value, float(low), float(high)),

@@ -24,7 +24,7 @@ from experiments.studies.twins.settings import (
     WIDEST,
     WIDEST_OTHERS,
 )
-from experiments.sweeps.plan import planned
+from experiments.sweeps.plan import plan_experiments
 from experiments.twin.make import Twin, make_twin
 from sim.formats.detect import read_any
 from sim.recording import Recording
@@ -41,14 +41,14 @@ def run(profile: Profile, out: Results, on_progress: Progress) -> None:
         `quick`: 4 simulations of each log in place of 50.
     """
     runs = {
-        kind: dict(zip(names, planned([f"study=twins/{kind}"]), strict=True))
+        kind: dict(zip(names, plan_experiments([f"study=twins/{kind}"]), strict=True))
         for kind, names in METHODS.items()
     }
     seeds = range(FIRST_SEED, FIRST_SEED + RUNS[profile])
     jobs = [(log, seed, runs) for log in LOGS for seed in (None, *seeds)]
     made = tables_of(errors, jobs, on_progress)
-    pairs = predicted(made["runs"])
-    out.write_tables(**made, pairs=pairs, others=of_others(pairs))
+    pairs = predict_pairs(made["runs"])
+    out.write_tables(**made, pairs=pairs, others=held_by_others(pairs))
 
 
 @functools.lru_cache(maxsize=1)
@@ -62,7 +62,7 @@ def errors(log: str, seed: int | None, runs: dict[str, dict[str, Experiment]]) -
     """Error of each estimator on a simulation of a log's second half; seed None: on the log."""
     twin = twin_of(log)
     kind = SCANS if twin.grid is not None else LANDMARKS
-    recording = twin.rest if seed is None else twin.simulated(seed)
+    recording = twin.rest if seed is None else twin.simulate(seed)
     about: Row = {"log": log, "kind": kind, "seed": -1 if seed is None else seed}
     rows = [
         {**about, "method": name, "status": recording.status, **_error(twin, run, recording, seed)}
@@ -82,7 +82,7 @@ def _error(twin: Twin, run: Experiment, recording: Recording, seed: int | None) 
     return {key: scores.get(key, math.nan) for key in _SCORES}
 
 
-def predicted(runs: pd.DataFrame) -> pd.DataFrame:
+def predict_pairs(runs: pd.DataFrame) -> pd.DataFrame:
     """A row a pair of log and estimator: its real error, and what the twin predicts."""
     rows: list[Row] = []
     for (log, method), group in runs.groupby(["log", "method"], sort=False):
@@ -108,7 +108,7 @@ def predicted(runs: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def of_others(pairs: pd.DataFrame) -> pd.DataFrame:
+def held_by_others(pairs: pd.DataFrame) -> pd.DataFrame:
     """A row a log and the twin of another log of its kind: the share of errors that it holds."""
     both = pairs.merge(pairs, on=["kind", "method"], suffixes=("", "_twin"))
     both["held"] = (both.low_m_twin <= both.error_m) & (both.error_m <= both.high_m_twin)

@@ -264,7 +264,7 @@ def test_loops_close_and_bound_the_error(laps):
 def test_false_closures_are_not_believed(laps, monkeypatch):
     """As many false candidates as right ones, each within what its own pose allows."""
     rng = np.random.default_rng(1)
-    proposed = GraphSlam.proposed
+    proposed = GraphSlam.propose_closures
     planted = []
 
     def with_false_ones(self):

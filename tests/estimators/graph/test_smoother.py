@@ -14,7 +14,7 @@ from estimators.graph.fixed_lag import FixedLag
 from estimators.graph.landmark_drive import _between
 from estimators.graph.least_squares import LeastSquaresOptions, Problem, solve
 from estimators.graph.smoother import Smoother
-from estimators.landmarks.stereo import LEAST_DEPTH_M, StereoModel
+from estimators.landmarks.stereo import MIN_DEPTH_M, StereoModel
 from experiments.evaluation.metrics import nees
 from experiments.gate.conform import check_estimator
 from sim import se2
@@ -67,7 +67,7 @@ def small_problem(seed, camera=CAMERA, n_poses=8, n_landmarks=12):
 
 def image(points):
     x, y, z = points.T
-    z = np.maximum(z, LEAST_DEPTH_M)  # wrong ids put landmarks anywhere
+    z = np.maximum(z, MIN_DEPTH_M)  # wrong ids put landmarks anywhere
     return np.stack([x, y, np.full_like(x, CAMERA.baseline_m)], 1) * CAMERA.focal_px / z[:, None]
 
 

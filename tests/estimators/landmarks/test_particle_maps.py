@@ -11,7 +11,7 @@ from estimators.landmarks import particle_kernels as ekf
 from estimators.landmarks.particle_kernels import LANES
 from estimators.landmarks.particle_maps import LandmarkMaps
 from estimators.landmarks.stereo import StereoModel
-from estimators.particles import in_place
+from estimators.particles import keep_survivors
 from sim import se2
 from sim.sensors import Mount, StereoCamera
 
@@ -61,7 +61,7 @@ class Batch:
         return self.maps.rows(np.arange(len(self.points)))
 
     def sums(self):
-        logs = ekf.summed(self.state, N_PARTICLES)
+        logs = ekf.log_weights(self.state, N_PARTICLES)
         return logs + ekf.log_scale(self.points, self.camera)
 
 
@@ -201,7 +201,7 @@ def test_maps_follow_the_ancestry(maps):
     numbers = ours.data.reshape(len(ours.data), -1, 9, LANES)
     m = np.arange(n)
     for generation in range(600):
-        ancestors = in_place(rng.integers(n, size=n), n)
+        ancestors = keep_survivors(rng.integers(n, size=n), n)
         ours.resample(ancestors)
         theirs, carried = theirs[:, ancestors], carried[:, ancestors]
         touched = rng.choice(n_slots - 1, 2, replace=False)  # the last slot only in the end

@@ -56,7 +56,7 @@ def test_ranked_is_the_sorted_value():
     for n in (1, 2, 3, 50, 51):
         values = rng.integers(0, 20, n).astype(float)
         values[rng.random(n) < 0.1] = np.inf
-        assert [scan_lines.ranked(values, k) for k in range(n)] == sorted(values)
+        assert [scan_lines.select(values, k) for k in range(n)] == sorted(values)
 
 
 def test_noise_is_the_median_of_second_differences(scans):
@@ -276,7 +276,7 @@ def test_points_agree_are_denied_or_cannot_be_judged(full_circle):
     scan, other = scans
     tolerance, agreed, denied = 0.05, np.zeros((3, 3)), np.zeros((3, 3))
     pose, lever = np.array([0.3, 0.2, 0.1]), (0.1, -0.2)
-    icp_judgement.confront(scan, other, pose, 0.3, lever, tolerance, agreed, denied)
+    icp_judgement.count_agreement(scan, other, pose, 0.3, lever, tolerance, agreed, denied)
     expected = [np.zeros((3, 3)), np.zeros((3, 3))]  # denied, agreed
     for point, line in zip(scan.points, scan.line_of_point, strict=True):
         at = se2.transform(pose, point[None])[0]

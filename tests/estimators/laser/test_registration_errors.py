@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from experiments.evaluation import registration_errors
-from experiments.evaluation.registration_errors import measured, scenes
+from experiments.evaluation.registration_errors import measure, sample_scenes
 from experiments.runs.experiment import Experiment
 from sim import se2
 from sim.sensors import Laser, Mount
@@ -20,7 +20,7 @@ def world():
 def test_scenes_lie_in_their_place(world):
     rng = np.random.default_rng(0)
     for place in ("corridor_bare", "curve", "corner"):
-        for scene in scenes(world, place, LASER.mount.pose, rng, 5):
+        for scene in sample_scenes(world, place, LASER.mount.pose, rng, 5):
             base = se2.compose(scene.T_w_target, se2.inverse(LASER.mount.pose))
             assert world.clearance_m(base) > 0.35
             near = base[:2] + np.array([[0, 0], [0.3, 0], [-0.3, 0], [0, 0.3], [0, -0.3]])
@@ -32,8 +32,8 @@ def test_scenes_lie_in_their_place(world):
 def test_nees_distinguishes_a_fitting_covariance_from_a_wrong_one(world, monkeypatch):
     def table():
         rng = np.random.default_rng(4)
-        (scene,) = scenes(world, "corridor_objects", LASER.mount.pose, rng, 1)
-        found = measured(scene, LASER, rng, 40, 3)
+        (scene,) = sample_scenes(world, "corridor_objects", LASER.mount.pose, rng, 1)
+        found = measure(scene, LASER, rng, 40, 3)
         return found[found["metric"] == "point_to_line"].set_index("method")
 
     found = table()

@@ -130,10 +130,10 @@ def test_number_of_particles_follows_fox():
         poses = np.zeros((2 * k, 3))
         poses[:, 0] = -3.0 + 0.5 * (np.arange(2 * k) // 2 % 14) + 0.25
         poses[:, 2] = -3.0 + 0.17 * (np.arange(2 * k) // 2 // 14)
-        assert estimator._bins.needed(poses) == pytest.approx(
+        assert estimator._bins.count_particles(poses) == pytest.approx(
             chi2.ppf(0.99, k - 1) / (2 * 0.02), rel=0.03 if k > 2 else 0.2
         )
-    assert estimator._bins.needed(np.zeros((9, 3))) == 1
+    assert estimator._bins.count_particles(np.zeros((9, 3))) == 1
 
 
 def test_a_scan_is_not_counted_beyond_what_the_particles_bear():

@@ -8,7 +8,7 @@ import pytest
 
 from estimators.base import Prior, run
 from estimators.topological.node_weights import node_log_weights
-from estimators.topological.place_refinement import Refiner, likely_turns_rad
+from estimators.topological.place_refinement import Refiner, find_turns_rad
 from estimators.topological.topological_map import Edges, from_arrays, from_recording
 from estimators.topological.topological_mcl import TopologicalMcl
 from experiments.gate.conform import check_estimator
@@ -184,7 +184,7 @@ def test_conforms():
 def test_a_kidnapped_robot_is_found_again_with_injection_only(injection):
     recording, prior = place_route()
     rows = np.concatenate([np.arange(12), np.arange(25, 40)])
-    taken = places.resequenced(recording, rows)
+    taken = places.resequence(recording, rows)
     lost = dataclasses.replace(prior, mean=None, covariance=None)
     estimator = TopologicalMcl(injection=injection, sigma_l_m=1.0)
     found = run(estimator, taken, lost, np.random.default_rng(1))
@@ -282,9 +282,9 @@ def test_turns_are_those_between_outlines():
     outline = run_.log("lidar3d")["ranges_m"][5, 8]
     for beams in (0, 17, -120):
         turned = np.roll(outline, -beams)  # the robot turned counter-clockwise
-        best = likely_turns_rad(turned, outline)[0]
+        best = find_turns_rad(turned, outline)[0]
         assert best == pytest.approx(math.radians(beams), abs=1e-6)
-    assert likely_turns_rad(np.full(360, 2.0, np.float32), outline)
+    assert find_turns_rad(np.full(360, 2.0, np.float32), outline)
 
 
 def test_refinement_finds_the_pose_from_a_node_nearby():

@@ -11,7 +11,7 @@ from estimators.odometry import Odometry
 from experiments.calibration.logs import calibrate_track, dead_reckoning_rms_m, scanner_positions
 from experiments.studies.real_logs import settings
 from experiments.studies.real_logs.grid_match import beam_points, best_fit
-from experiments.sweeps.plan import planned
+from experiments.sweeps.plan import plan_experiments
 from sim import se2
 from sim.formats.lego import TickLog, parse_motors, parse_reference
 from sim.formats.mrclam import CAMERA
@@ -94,7 +94,7 @@ def test_scans_find_their_place_and_the_maps_meaning():
     ],
 )
 def test_every_run_of_a_study_has_its_name(study, names):
-    runs = dict(zip(names, planned(f"study=real_logs/{study}".split()), strict=True))
+    runs = dict(zip(names, plan_experiments(f"study=real_logs/{study}".split()), strict=True))
     methods = {
         "ICP": IcpOdometry,
         "EKF of": EkfIcp,

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments.calibration.sheet import COLUMNS, calibrate_sheet, read_sheet, unwrapped
+from experiments.calibration.sheet import COLUMNS, calibrate_sheet, read_sheet, unwrap_headings
 from sim import se2
 from sim.errors import InputError
 from sim.robot.drive import DifferentialDrive
@@ -104,10 +104,12 @@ def test_wrapped_headings_follow_the_short_turns():
         np.array([9.0]),
     ]
     turns = [1.5, 5.0, 0.0, 3.0 * math.pi]
-    found = unwrapped(headings, turns)
+    found = unwrap_headings(headings, turns)
     np.testing.assert_allclose(np.concatenate(found), [1.2, 1.3, 4.1, 0.1, 9.0], atol=1e-12)
     # a robot that turns short did not wrap
-    np.testing.assert_allclose(unwrapped([np.array([0.66]), np.array([2.2])], [1.5, 5.0])[1], 2.2)
+    np.testing.assert_allclose(
+        unwrap_headings([np.array([0.66]), np.array([2.2])], [1.5, 5.0])[1], 2.2
+    )
 
 
 def test_what_is_wrong_is_named_with_its_line(tmp_path):

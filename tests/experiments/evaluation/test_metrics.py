@@ -44,7 +44,7 @@ def test_ate_agrees_with_evo(seed):
     reference, moved = for_evo(truth), for_evo(means)
     moved.align(reference, correct_scale=False)
     ape.process_data((reference, moved))
-    fitted = metrics.aligned(truth, means)
+    fitted = metrics.align(truth, means)
     aligned = metrics.rms(metrics.position_errors_m(truth, fitted))
     assert aligned == pytest.approx(ape.get_statistic(evo_metrics.StatisticsType.rmse), abs=1e-9)
     assert aligned < ours
@@ -59,7 +59,7 @@ def test_headings_agree_with_evo_on_both_sides_of_the_seam(turn):
     assert np.allclose(np.abs(metrics.heading_errors_rad(truth, means)), ape.error, atol=1e-9)
     moved.align(reference, correct_scale=False)
     ape.process_data((reference, moved))
-    aligned = metrics.heading_errors_rad(truth, metrics.aligned(truth, means))
+    aligned = metrics.heading_errors_rad(truth, metrics.align(truth, means))
     assert np.allclose(np.abs(aligned), ape.error, atol=1e-7)
     assert np.abs(means[:, 2] - truth[:, 2]).max() > np.pi  # the seam is crossed
     values = metrics.nees(truth, means, np.tile(np.eye(3), (len(truth), 1, 1)))
@@ -106,7 +106,7 @@ def test_rpe_over_frames_agrees_with_evo(delta):
 def test_aligned_errors_do_not_see_a_rigid_motion(motion):
     truth, means = trajectories(1, 60)
     moved = se2.compose(motion, means)
-    before, after = metrics.aligned(truth, means), metrics.aligned(truth, moved)
+    before, after = metrics.align(truth, means), metrics.align(truth, moved)
     assert np.allclose(before[:, :2], after[:, :2], atol=1e-9)
     assert np.allclose(se2.wrap(before[:, 2] - after[:, 2]), 0, atol=1e-9)
 

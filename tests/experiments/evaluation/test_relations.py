@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from experiments.evaluation.relations import relation_errors
-from experiments.evaluation.time_sync import aligned_ate_m, interpolate, nearest
+from experiments.evaluation.time_sync import aligned_ate_m, interpolate, nearest_rows
 from sim import se2
 from sim.errors import InputError
 from sim.formats.rawseeds import read_trajectory
@@ -27,8 +27,8 @@ def test_nearest_is_the_nearest():
     stamps = np.array([0.0, 1.0, 2.5])
     wanted = np.array([-1.0, 0.4, 0.5, 0.6, 1.74, 1.76, 9.0])
     expected = [int(np.argmin(np.abs(stamps - w))) for w in wanted]
-    np.testing.assert_array_equal(nearest(stamps, wanted), expected)
-    np.testing.assert_array_equal(nearest(stamps[:1], wanted), 0)
+    np.testing.assert_array_equal(nearest_rows(stamps, wanted), expected)
+    np.testing.assert_array_equal(nearest_rows(stamps[:1], wanted), 0)
 
 
 def test_interpolation_goes_the_shorter_way_and_keeps_out_of_gaps():

@@ -3,17 +3,17 @@ import pytest
 
 from experiments.evaluation import statistics
 from experiments.evaluation.statistics import Interval
-from experiments.judging.claim import Subject, equivalent, judged
+from experiments.judging.claim import Subject, judge_equivalent, judge_interval
 from sim.errors import InputError
 
 ABOUT = Subject("X1", "a ratio")
 
 
 def test_verdicts():
-    assert judged(Interval(1, 0.9, 1.1), 0.8, 1.25) == "reproduced"
-    assert judged(Interval(1, 0.7, 1.1), 0.8, 1.25) == "undecided"
-    assert judged(Interval(2, 1.5, 2.5), 0.8, 1.25) == "not_reproduced"
-    assert judged(Interval(2, np.nan, np.nan), 0.8) == "undecided"
+    assert judge_interval(Interval(1, 0.9, 1.1), 0.8, 1.25) == "reproduced"
+    assert judge_interval(Interval(1, 0.7, 1.1), 0.8, 1.25) == "undecided"
+    assert judge_interval(Interval(2, 1.5, 2.5), 0.8, 1.25) == "not_reproduced"
+    assert judge_interval(Interval(2, np.nan, np.nan), 0.8) == "undecided"
 
 
 @pytest.mark.parametrize("kind", ["mean", "bootstrap", "log_ratio"])
@@ -46,8 +46,8 @@ def test_share_interval_is_conservative():
 def test_equivalence_and_trend():
     rng = np.random.default_rng(2)
     a = rng.lognormal(0, 0.1, 100)
-    same = equivalent(ABOUT, "", a * rng.lognormal(0.0, 0.1, 100), a, 0.25)
-    other = equivalent(ABOUT, "", a * rng.lognormal(0.4, 0.1, 100), a, 0.25)
+    same = judge_equivalent(ABOUT, "", a * rng.lognormal(0.0, 0.1, 100), a, 0.25)
+    other = judge_equivalent(ABOUT, "", a * rng.lognormal(0.4, 0.1, 100), a, 0.25)
     assert same.verdict == "reproduced"
     assert other.verdict == "not_reproduced"
     assert other.found.value == pytest.approx(np.exp(0.4), rel=0.05)
@@ -66,9 +66,9 @@ def test_too_few_data_decide_nothing():
         statistics.bootstrap_interval([], lambda v: float(v.mean()), rng),
         statistics.share_interval(0, 0),
         statistics.log_ratio_interval([1.0], [1.0]),
-        equivalent(ABOUT, "", [1.0], [1.0], 0.25).found,
+        judge_equivalent(ABOUT, "", [1.0], [1.0], 0.25).found,
     ):
-        assert judged(found, 0.5, 2.0) == "undecided"
+        assert judge_interval(found, 0.5, 2.0) == "undecided"
 
 
 def test_the_bootstrap_draws_whole_recordings():
@@ -96,17 +96,17 @@ def test_the_bootstrap_of_few_recordings_is_wide_enough():
 
 
 def test_equivalence_without_spread():
-    same = equivalent(ABOUT, "", [1.1, 2.2, 3.3], [1.0, 2.0, 3.0], 0.25)
+    same = judge_equivalent(ABOUT, "", [1.1, 2.2, 3.3], [1.0, 2.0, 3.0], 0.25)
     assert same.found.value == pytest.approx(1.1)
     assert same.verdict == "reproduced"
-    assert equivalent(ABOUT, "", [2.0, 4.0], [1.0, 2.0], 0.25).verdict == "not_reproduced"
+    assert judge_equivalent(ABOUT, "", [2.0, 4.0], [1.0, 2.0], 0.25).verdict == "not_reproduced"
 
 
 def test_equivalence_errs_as_often_as_it_says():
     """At the margin itself, the test wrongly finds equivalence in about 5 % of samples."""
     rng, n = np.random.default_rng(7), 600
     found = [
-        equivalent(
+        judge_equivalent(
             Subject("X1", ""), "", rng.lognormal(np.log(1.25), 0.1, 30), np.ones(30), 0.25
         ).verdict
         for _ in range(n)

@@ -154,7 +154,7 @@ def test_other_recordings_are_refused():
         (then.assign(checksum="x", fingerprint=7.0), "what simulates it has changed"),
         (then.assign(checksum="x", fingerprint=math.nan), "what simulates it has changed"),
         (then.iloc[:4], "other recordings"),
-        (then.assign(estimator="f"), "does not know f"),
+        (then.assign(estimator="f"), "has no f"),
     ):
         with pytest.raises(InputError, match=words) as refusal:
             regress.compare({"accepted": then}, now)

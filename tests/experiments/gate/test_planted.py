@@ -64,7 +64,7 @@ def test_every_estimator_of_the_suite_has_three_kinds_of_faults():
 
 def test_reordered_draws_are_other_draws_of_the_same_law():
     sound = estimate("fastslam", lambda *_: nullcontext())
-    assert np.abs(estimate("fastslam", power.reordered) - sound).max() > 1e-9
+    assert np.abs(estimate("fastslam", power.reorder_draws) - sound).max() > 1e-9
 
 
 def rows(errors):
@@ -124,10 +124,10 @@ def test_drawn_checks_alarm_at_faults_only():
 
 def test_smallest_worsening_grows_with_the_spread():
     made = pool(0.1)
-    fine = power.smallest(made, ("b", "lost"))
+    fine = power.smallest_detectable(made, ("b", "lost"))
     assert 0.005 < fine < 0.05
     size, of_error = made.faulty["b", "lost"]
     rng = np.random.default_rng(5)
     rough = {e: v * np.exp(0.3 * rng.standard_normal(v.shape)) for e, v in of_error.items()}
     other = dataclasses.replace(made, faulty={("b", "lost"): (size, rough)})
-    assert power.smallest(other, ("b", "lost")) > 1.5 * fine
+    assert power.smallest_detectable(other, ("b", "lost")) > 1.5 * fine

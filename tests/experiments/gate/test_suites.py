@@ -88,7 +88,7 @@ def trajectories(inputs, folder, noise_m=0.0, seed=0):
     for log in sorted(inputs.glob("*.log")):
         made = carmen.to_recording(carmen.read_carmen(log))
         x0, y0, heading0 = np.loadtxt(log.with_suffix(".start.txt"), max_rows=1)
-        poses = assemble.rolled(made.wheels, made.robot.track_m)
+        poses = assemble.pose_by_wheels(made.wheels, made.robot.track_m)
         for repeat in range(2):
             drift = (0.01 * rng.random() + noise_m) * np.linspace(0, 1, len(poses))
             moved = se2.compose(np.array([x0, y0, heading0]), poses)
@@ -163,7 +163,7 @@ def test_what_is_made_elsewhere_needs_its_trajectories(elsewhere, small, tmp_pat
     with pytest.raises(InputError, match="no trajectories here"):
         baseline.accept(str(elsewhere), "why", candidate=tmp_path / "none")
     with pytest.raises(InputError, match="made elsewhere; check a candidate"):
-        read_suite(elsewhere).of(["mine"]).made(elsewhere=False)
+        read_suite(elsewhere).select(["mine"]).made(elsewhere=False)
     with pytest.raises(InputError, match="marked `elsewhere: true`"):
         baseline.check(str(small), candidate=tmp_path)
 
@@ -173,7 +173,7 @@ def test_recordings_of_the_check_turn():
     suite = read_suite(suite_path("check"))
     for group, overrides in suite.overrides.items():
         seed = suite.first_seed
-        read = Experiment.compose(overrides).replaced(seed=seed, world_seed=seed).recordings()
+        read = Experiment.compose(overrides).replace(seed=seed, world_seed=seed).recordings()
         for recording in read.robots:
             assert recording.status == "ok"
             turned = np.abs(np.diff(np.unwrap(recording.truth.poses[:, 2]))).sum()

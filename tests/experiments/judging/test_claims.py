@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from experiments.evaluation.statistics import Interval
-from experiments.judging.claim import Subject, Verdict, lower, select, select_all
+from experiments.judging.claim import Subject, Verdict, judge_lower, select, select_all
 from experiments.judging.claims_file import COLUMNS, read_claims, write_claims
 from experiments.judging.results import Profile
 from experiments.papers.gil2008 import claims as gil2008
@@ -228,13 +228,13 @@ def test_writing_keeps_other_papers_rows(tmp_path):
 
 def test_arms_that_are_equal_or_few_decide_rightly():
     same = np.linspace(1.0, 2.0, 20)
-    assert lower(ABOUT, "", same, same).verdict == "not_reproduced"
-    assert lower(ABOUT, "", same[:1], same[:1]).verdict == "undecided"
+    assert judge_lower(ABOUT, "", same, same).verdict == "not_reproduced"
+    assert judge_lower(ABOUT, "", same[:1], same[:1]).verdict == "undecided"
     rng = np.random.default_rng(0)
     spread = np.exp(0.02 * rng.standard_normal(20))
-    assert lower(ABOUT, "", 0.8 * same * spread, same).verdict == "reproduced"
-    assert lower(ABOUT, "", 1.2 * same * spread, same).verdict == "not_reproduced"
-    said = lower(ABOUT, "", 1.001 * same * spread, same)
+    assert judge_lower(ABOUT, "", 0.8 * same * spread, same).verdict == "reproduced"
+    assert judge_lower(ABOUT, "", 1.2 * same * spread, same).verdict == "not_reproduced"
+    said = judge_lower(ABOUT, "", 1.001 * same * spread, same)
     assert said.found.low < 1.0 < said.found.high
     assert said.found.low > 0.95  # hardly a gain, but the interval spans the criterion
     assert said.verdict == "undecided"

@@ -14,9 +14,9 @@ from experiments.judging.claim import (
     Role,
     Subject,
     Verdict,
-    banded,
     beside,
     headline_verdict,
+    judge_bounds,
     more_to_settle,
     select,
     select_all,
@@ -45,10 +45,12 @@ from sim.errors import InputError
 
 RESULTS = SOURCE / "results"
 ABOUT = Subject("PB1", "ratio", method="icp", size=3)
-GOOD = banded(ABOUT, "a ratio", Interval(1.0, 0.9, 1.1), 0.8, 1.25)
-BAD = banded(dataclasses.replace(ABOUT, size=4), "another", Interval(2.0, 1.9, 2.1), 0.8, 1.25)
+GOOD = judge_bounds(ABOUT, "a ratio", Interval(1.0, 0.9, 1.1), 0.8, 1.25)
+BAD = judge_bounds(
+    dataclasses.replace(ABOUT, size=4), "another", Interval(2.0, 1.9, 2.1), 0.8, 1.25
+)
 FUSED = dataclasses.replace(ABOUT, method="fusion")
-OPEN = banded(FUSED, "a third", Interval(1.2, 1.1, 1.3), 0.8, 1.25, n=20)
+OPEN = judge_bounds(FUSED, "a third", Interval(1.2, 1.1, 1.3), 0.8, 1.25, n=20)
 
 
 def verdict_of(*claims):
@@ -224,3 +226,12 @@ def test_criteria_hold_the_rule_and_nothing_that_came_out(tracked):
 
 def test_a_claim_says_its_role():
     assert Claim(ABOUT, "s", Interval.exact(1.0), "c", Verdict.REPRODUCED).role is Role.HEADLINE
+
+
+def test_a_claim_is_selected_if_it_is_the_only_match():
+    claims = [shown(Subject("X1", name), "s", Interval(1.0, 0.0, 2.0)) for name in ("a", "a", "b")]
+    assert select(claims, quantity="b") is claims[2]
+    assert select_all(claims, claim="X1", quantity="a") == claims[:2]
+    for wanted, count in (({"quantity": "a"}, 2), ({"quantity": "c"}, 0)):
+        with pytest.raises(LookupError, match=f"{count} statistics with "):
+            select(claims, **wanted)

@@ -16,7 +16,7 @@ from experiments.judging.results import Profile
 from experiments.papers.gil2008 import claims as judge
 from experiments.papers.gil2008 import recordings, scores, settings, study
 from experiments.runs.experiment import Experiment
-from experiments.sweeps.plan import planned
+from experiments.sweeps.plan import plan_experiments
 from tests.fixtures.claims import concluded
 from tests.fixtures.fakes import circle, tracking_prior, true_ids
 
@@ -165,7 +165,7 @@ def test_revisited_ground_is_where_the_robot_was_long_before():
     angle = 2 * np.pi * along / lap
     radius = lap / (2 * np.pi)
     poses = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), angle])
-    again = scores.revisited(poses)
+    again = scores.on_revisited_ground(poses)
     assert not again[along < 38.5].any()
     assert again[along > 40.0].all()
     growing = poses + np.column_stack([0.01 * along, 0 * along, 0 * along])
@@ -180,7 +180,7 @@ def test_revisited_ground_is_where_the_robot_was_long_before():
 
 @pytest.mark.slow
 def test_plans_are_within_their_means(monkeypatch):
-    composed = functools.cache(lambda *lines: list(planned(lines)))
+    composed = functools.cache(lambda *lines: list(plan_experiments(lines)))
     monkeypatch.setattr(study, "planned", lambda lines: composed(*lines))
     full, quick = (list(study.plan(profile)) for profile in (Profile.FULL, Profile.QUICK))
     n_full, n_quick = (sum(run.repeats for _, run in runs) for runs in (full, quick))
@@ -195,7 +195,7 @@ def test_plans_are_within_their_means(monkeypatch):
         return table, json.dumps({**run.config, **other})
 
     bound = {json.dumps(run.config) for table, run in full if table == "bound"}
-    assert bound == {json.dumps(run.config) for run in planned(["study=gil2008/bound"])}
+    assert bound == {json.dumps(run.config) for run in plan_experiments(["study=gil2008/bound"])}
 
     # the quick one leaves out worlds and repeats, but nothing that is judged or drawn
     assert {kind(*run) for run in full} == {kind(*run) for run in quick}

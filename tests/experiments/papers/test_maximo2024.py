@@ -11,13 +11,13 @@ from experiments.judging.results import Profile, Results
 from experiments.papers.maximo2024 import claims, figures, places, settings, study, worlds
 from experiments.runs.paths import SOURCE
 from experiments.runs.seeds import stream
-from experiments.sweeps.plan import planned
+from experiments.sweeps.plan import plan_experiments
 from tests.fixtures.claims import concluded
 
 
 @pytest.fixture(scope="module")
 def case():
-    return worlds.case_of("umh", 5)
+    return worlds.make_case("umh", 5)
 
 
 def weighting(m1, m2, m3, name="oxford", n=24, seed=0, column="error_m"):
@@ -221,9 +221,9 @@ def test_our_own_claims_follow_their_tables():
 
 def test_settling_has_to_last():
     errors = np.array([9.0, 0.0, 9.0, *([1.0] * 10), 9.0])
-    assert worlds.settled_at(errors, 2.0) == 3.0
-    assert math.isnan(worlds.settled_at(errors[:-2], 2.0))
-    assert math.isnan(worlds.settled_at(errors, 0.5))
+    assert worlds.settling_step(errors, 2.0) == 3.0
+    assert math.isnan(worlds.settling_step(errors[:-2], 2.0))
+    assert math.isnan(worlds.settling_step(errors, 0.5))
 
 
 def test_parameters_are_the_best_of_the_papers_choice():
@@ -238,7 +238,7 @@ def test_parameters_are_the_best_of_the_papers_choice():
 
 @pytest.mark.parametrize("name", ["weighting", "particles", "dispersion", "starts", "quality"])
 def test_sweeps_have_the_parameters_of_the_study(name):
-    for run in planned([f"study=maximo2024/{name}", "seed=1000"]):
+    for run in plan_experiments([f"study=maximo2024/{name}", "seed=1000"]):
         own, route = run.config["estimator"], run.config["recording"]["geometry"]
         spacings, sigma_m, n_nearest = settings.TUNED[route]
         far = round(spacings * places.GEOMETRIES[route].spacing_m, 2)
@@ -329,7 +329,7 @@ def test_the_filter_of_the_study_is_the_one_as_printed(case):
         "multinomial",
     )
     assert (estimator.injection, estimator.estimate, estimator.refine) == (0.0, "mean", False)
-    noisy = worlds.case_of("umh", 5, "recording.noise_weight=1.6")
+    noisy = worlds.make_case("umh", 5, "recording.noise_weight=1.6")
     np.testing.assert_array_equal(noisy.known_map.positions_m, case.known_map.positions_m)
     assert not np.array_equal(noisy.known_map.descriptors, case.known_map.descriptors)
 
@@ -357,7 +357,7 @@ def test_examples_hold_what_the_figures_draw(case):
 
 
 def test_controls_have_the_parameters_and_the_route_of_the_headlines(case):
-    control = worlds.case_of("umh_plane", 5)
+    control = worlds.make_case("umh_plane", 5)
     np.testing.assert_array_equal(control.known_map.positions_m, case.known_map.positions_m)
     assert worlds.options(control) == worlds.options(case)
     along, plane = (c.recording.truth.poses[:, :2] for c in (case, control))

@@ -132,7 +132,7 @@ def test_descriptors_are_unit_vectors_found_again_by_place():
 def test_resequenced_recordings_move_as_the_wheels_did():
     recording = place_world(UMH, 0).recording
     rows = np.concatenate([np.arange(10, 20), np.arange(60, 70)])
-    cut = places.resequenced(recording, rows)
+    cut = places.resequence(recording, rows)
     frames, whole = list(cut.frames()), list(recording.frames())
     for i, row in enumerate(rows):
         np.testing.assert_array_equal(

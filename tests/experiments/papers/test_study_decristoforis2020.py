@@ -19,7 +19,9 @@ def small(_full, out):
     (office,) = study._planned("methods", 1, "route.distance_m=300.0", "sensors.laser.rate_hz=2.0")
     beliefs = study._planned("beliefs", 2, "route.distance_m=6.0")
     corridors = study._planned("corridor", 2)
-    adjusted = study.planned(["study=decristoforis2020/tuning", "seed=60", "route.distance_m=3.0"])
+    adjusted = study.plan_experiments(
+        ["study=decristoforis2020/tuning", "seed=60", "route.distance_m=3.0"]
+    )
     adjusted = [run for run in adjusted if run.config["estimator"]["turn_noise"] == 2.0][:2]
     noise = ["robot.kr=1e-6", "sensors.laser.sigma_range_m=0.01", "route.distance_m=4.0"]
     seeds = (JUDGED_SEED, JUDGED_SEED + 1)

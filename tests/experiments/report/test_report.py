@@ -383,8 +383,8 @@ def test_the_first_screen_has_the_leaderboard_by_world(tmp_path):
 def test_the_first_screen_names_the_paper_that_holds_best():
     good, bad, open_ = Verdict.REPRODUCED, Verdict.NOT_REPRODUCED, Verdict.UNDECIDED
     tallies = {"a": [(good, 3), (bad, 1)], "b": [(good, 6), (bad, 2)], "c": [(open_, 6)], "d": []}
-    assert contents.holding_best(tallies) == [("a", 3, 4), ("b", 6, 8)]
-    assert contents.holding_best({"c": [(open_, 6)], "d": []}) == []
+    assert contents.papers_holding_best(tallies) == [("a", 3, 4), ("b", 6, 8)]
+    assert contents.papers_holding_best({"c": [(open_, 6)], "d": []}) == []
 
 
 def test_the_first_screen_has_the_leaderboard_on_lasers(tmp_path):

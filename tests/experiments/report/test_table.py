@@ -6,10 +6,10 @@ from estimators.base import Estimate
 from experiments.runs.row import (
     Outcome,
     Status,
-    as_tables,
     check_row,
-    joined,
+    concatenate,
     read_rows,
+    to_tables,
     write_frame,
 )
 from sim.errors import InputError
@@ -24,7 +24,7 @@ ROW = {
 
 
 def write_rows(rows, path):
-    write_frame(joined(as_tables(rows)), path)
+    write_frame(concatenate(to_tables(rows)), path)
 
 
 def an_estimate(seed=0):

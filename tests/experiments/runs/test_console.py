@@ -98,6 +98,6 @@ def test_an_interrupt_is_said_whatever_it_caused(capsys, monkeypatch):
     error = InputError("half composed")
     error.__context__ = KeyboardInterrupt("interrupted; 3 of 9 runs are kept")
     with pytest.raises(SystemExit) as ended:
-        console.end(error)
+        console.exit_with(error)
     assert ended.value.code == 130
     assert "3 of 9 runs are kept" in capsys.readouterr().err

@@ -4,14 +4,14 @@ import joblib
 import pytest
 from threadpoolctl import threadpool_info
 
-from experiments.runs.evaluate import limited_blas
+from experiments.runs.evaluate import limit_blas
 from sim.errors import InputError
 
 NAME = "ESTIMA_BLAS_THREADS"
 
 
 def threads():
-    with limited_blas():
+    with limit_blas():
         return {pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"}
 
 
@@ -37,4 +37,4 @@ def test_workers_are_limited_too(monkeypatch):
 def test_a_wrong_number_of_threads_is_named(monkeypatch, value):
     monkeypatch.setenv(NAME, value)
     with pytest.raises(InputError, match=f"{NAME} must be a whole number, at least 1"):
-        limited_blas()
+        limit_blas()

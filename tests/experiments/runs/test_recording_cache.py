@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from experiments.runs.cache import cached, files, folder, limit_bytes, trim
+from experiments.runs.cache import fetch_or_make, files, folder, limit_bytes, trim
 from sim.errors import InputError
 from sim.recording import load
 from tests.sim.test_recording import small_recording
@@ -23,35 +23,35 @@ def test_the_cache_makes_once_and_mends_damage(tmp_path, monkeypatch):
         return small_recording()
 
     for _ in range(3):
-        recording = cached("a", make)
+        recording = fetch_or_make("a", make)
         assert recording.checksum == small_recording().checksum
     assert len(made) == 1
     path = folder() / "a.npz"
     path.write_bytes(path.read_bytes()[:-20])
-    cached("a", make)
+    fetch_or_make("a", make)
     assert len(made) == 2
-    cached("b", make)
+    fetch_or_make("b", make)
     assert len(made) == 3
     (folder() / "b.npz").write_bytes(path.read_bytes())  # the recording of another key
-    cached("b", make)
+    fetch_or_make("b", make)
     assert len(made) == 4
-    assert cached("b", make).config == small_recording().config
+    assert fetch_or_make("b", make).config == small_recording().config
     assert {file.suffix for file in folder().iterdir()} == {".npz"}
 
 
 def test_the_cache_drops_what_was_used_longest_ago_but_nothing_in_use(tmp_path, monkeypatch):
     monkeypatch.setenv("ESTIMA_RESULTS", str(tmp_path))
     for age, key in enumerate("abcd"):
-        cached(key, small_recording)
+        fetch_or_make(key, small_recording)
         os.utime(folder() / f"{key}.npz", (1000.0 + age, 1000.0 + age))
-    cached("b", small_recording)  # used again
+    fetch_or_make("b", small_recording)  # used again
     size = files()[0][1]
     with (folder() / "a.lock").open("w") as handle:
         fcntl.flock(handle, fcntl.LOCK_EX)
         assert trim(2 * size) == 2
     assert [path.stem for path, _ in files()] == ["a", "b"]
     monkeypatch.setenv("ESTIMA_CACHE_GIB", str(2.5 * size / 2**30))
-    cached("e", small_recording)
+    fetch_or_make("e", small_recording)
     assert [path.stem for path, _ in files()] == ["b", "e"]
     monkeypatch.setenv("ESTIMA_CACHE_GIB", "much")
     with pytest.raises(InputError, match="ESTIMA_CACHE_GIB"):
@@ -64,7 +64,7 @@ def _fetch(log):
             f.write("made\n")
         return small_recording()
 
-    cached("a", make)
+    fetch_or_make("a", make)
 
 
 def test_processes_share_one_making(tmp_path, monkeypatch):

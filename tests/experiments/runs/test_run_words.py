@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from experiments.cli.main import app
 from experiments.runs import console
 from experiments.runs.experiment import Experiment
-from experiments.runs.run import _print, expected_s, in_words
+from experiments.runs.run import _print, expected_duration_s, summarize
 from experiments.viewing.run_figure import run_figure
 from sim import compiled
 from sim.formats.tum import write_tum
@@ -26,15 +26,17 @@ def a_row(**changed):
 
 
 def test_errors_are_said_with_their_share_of_the_way_and_consistency():
-    assert in_words([a_row()]) == (
+    assert summarize([a_row()]) == (
         "position RMSE 0.3 m, 0.79 % of 38 m; consistent (NEES 3.2 of 3)"
     )
-    assert in_words([a_row(), a_row(ate_rmse_m=0.4)]).startswith("position RMSE 0.354 m")
-    assert "too sure of itself (NEES 9 of 3)" in in_words([a_row(nees_mean=9.0)])
-    assert "too cautious" in in_words([a_row(nees_mean=0.5)])
-    assert in_words([a_row(revised_ate_rmse_m=0.1)]).startswith("revised path: position RMSE 0.1 m")
-    assert in_words([{"distance_m": 3.0}]) == ""
-    assert in_words([{"ate_rmse_m": 0.3, "distance_m": 0.0}]) == "position RMSE 0.3 m"
+    assert summarize([a_row(), a_row(ate_rmse_m=0.4)]).startswith("position RMSE 0.354 m")
+    assert "too sure of itself (NEES 9 of 3)" in summarize([a_row(nees_mean=9.0)])
+    assert "too cautious" in summarize([a_row(nees_mean=0.5)])
+    assert summarize([a_row(revised_ate_rmse_m=0.1)]).startswith(
+        "revised path: position RMSE 0.1 m"
+    )
+    assert summarize([{"distance_m": 3.0}]) == ""
+    assert summarize([{"ate_rmse_m": 0.3, "distance_m": 0.0}]) == "position RMSE 0.3 m"
 
 
 @pytest.mark.parametrize(
@@ -48,18 +50,20 @@ def test_errors_are_said_with_their_share_of_the_way_and_consistency():
 def test_progress_knows_about_how_long_a_drive_is(overrides, within_s):
     alone = ["simulation.physics=kinematic", "sensors=encoder", "estimator=odometry"]
     experiment = Experiment.compose([*overrides, *alone])
-    assert expected_s(experiment) == pytest.approx(experiment.simulate().duration_s, abs=within_s)
+    assert expected_duration_s(experiment) == pytest.approx(
+        experiment.simulate().duration_s, abs=within_s
+    )
 
 
 def test_progress_does_not_know_how_long_other_drives_are():
-    assert expected_s(Experiment.compose(["route=square"])) is None
-    assert expected_s(Experiment.compose(["study=teams"])) > 10.0
+    assert expected_duration_s(Experiment.compose(["route=square"])) is None
+    assert expected_duration_s(Experiment.compose(["study=teams"])) > 10.0
 
 
 def test_a_timetable_takes_as_long_as_its_trajectory(tmp_path):
     write_tum(tmp_path / "way.tum", np.array([5.0, 6.0, 9.0]), np.zeros((3, 3)))
     way = ["route=timetable", f"route.path={tmp_path / 'way.tum'}"]
-    assert expected_s(Experiment.compose(way)) == 4.0
+    assert expected_duration_s(Experiment.compose(way)) == 4.0
 
 
 def test_recording_says_how_much_there_is_to_simulate(tmp_path, monkeypatch):

@@ -9,7 +9,7 @@ from evo.core.trajectory import PoseTrajectory3D
 
 from estimators.base import Estimate
 from experiments.cli import main as cli
-from experiments.runs.score import Scoring, described, error_table, scored_against
+from experiments.runs.score import Scoring, describe_scoring, error_table, match_and_align
 from experiments.trajectories.convert import write_estimate
 from experiments.trajectories.read import read_trajectory
 from experiments.viewing.compare import reference_of
@@ -78,7 +78,7 @@ def test_figures_are_those_of_evo(seed):
     offset_s = -0.25 * (seed % 2)
     for align in ("none", "start", "se2"):
         how = Scoring(align=align, match="nearest", offset_s=offset_s)
-        ours = error_table(scored_against(recording, given, how))
+        ours = error_table(match_and_align(recording, given, how))
         theirs = evo_table(for_evo(stamps, truth), for_evo(clock, means), align, offset_s)
         assert ours.keys() == theirs.keys()
         for error, values in theirs.items():
@@ -93,7 +93,7 @@ def test_of_equally_many_poses_the_pairs_are_those_of_evo(n):
     means = truth[np.searchsorted(stamps, clock)] + 0.1 * rng.standard_normal((n, 3))
     zeros = np.zeros((100, 3, 3))
     recording = reference_of(Estimate(stamps[:100], truth[:100], zeros))
-    scored = scored_against(
+    scored = match_and_align(
         recording, Estimate(clock, means, np.zeros((n, 3, 3))), Scoring(match="nearest")
     )
     reference, estimate = sync.associate_trajectories(
@@ -109,7 +109,7 @@ def test_a_pose_that_is_scored_twice_is_counted():
     clock = stamps[0] + np.array([0.0, 0.3, 0.4, 0.5])
     given = Estimate(clock, truth[:4], np.zeros((4, 3, 3)))
     how = Scoring(match="nearest", tolerance_s=0.12)
-    said = described(scored_against(recording, given, how), how)
+    said = describe_scoring(match_and_align(recording, given, how), how)
     assert "4 poses, 3 scored (1 of them again, with another true stamp)" in said
     assert "2 left out" in said
 
@@ -120,15 +120,15 @@ def test_what_was_scored_is_said():
     late = Estimate(
         stamps[50:100] + 7.0, truth[50:100], np.tile(np.eye(3), (50, 1, 1)), kind="online"
     )
-    scored = scored_against(recording, late, Scoring(offset_s=-7.0))
+    scored = match_and_align(recording, late, Scoring(offset_s=-7.0))
     assert scored.n_given == len(scored.truth) == 50
     assert scored.longest_gap_s == pytest.approx(stamps[-1] - stamps[99])
     assert error_table(scored)["position error, m"]["max"] < 1e-6
-    outside = scored_against(
+    outside = match_and_align(
         recording, late, Scoring(offset_s=float(stamps[-1] - stamps[80]) - 7.0)
     )
     assert (len(outside.truth), outside.n_left_out) == (31, 19)
-    turned = scored_against(
+    turned = match_and_align(
         recording,
         Estimate(late.stamps - 7.0, se2.compose(np.array([1.0, 2.0, np.pi / 2]), late.means),
                  np.tile(np.diag([4.0, 1.0, 1.0]), (50, 1, 1))),
@@ -137,7 +137,7 @@ def test_what_was_scored_is_said():
     assert turned.moved_by[2] == pytest.approx(-np.pi / 2)
     assert turned.estimate.covariances[0] == pytest.approx(np.diag([1.0, 4.0, 1.0]))
     with pytest.raises(InputError, match=r"0 of 50 poses meet the truth.*set --offset"):
-        scored_against(recording, late, Scoring(offset_s=1e4))
+        match_and_align(recording, late, Scoring(offset_s=1e4))
 
 
 @pytest.fixture(scope="module")
@@ -388,7 +388,7 @@ def test_options_that_make_no_sense_are_named(files, tmp_path, monkeypatch, caps
         ((one, "--tolerance", "-1"), "tolerance_s must be"),
         ((one, "--offset", "nan"), "offset_s must be a number"),
         ((one, "--cpu-seconds", "-1"), "cpu_seconds must be"),
-        ((one, "--topic", "odom"), "a topic is of a bag"),
+        ((one, "--topic", "odom"), "only a bag has topics"),
         ((folder / "est.mcap", "--topic", "none"), "no nav_msgs/Odometry on none"),
         ((one, two), "two trajectories called est"),
         ((one, "--name", "a/b"), "name must be one word"),

@@ -41,7 +41,7 @@ def test_a_journal_says_what_was_written(tmp_path):
     found = [rows for _, rows in store.journal_lines(path.read_bytes())]
     expected = [rows, [row(3, x=0.0), row(3, x=0.1, repeat=1)], [failed], []]
     assert json.dumps(found) == json.dumps(expected)
-    assert store.begun(tmp_path, "rows-") == {4}
+    assert store.find_begun_runs(tmp_path, "rows-") == {4}
     over = store.ended(tmp_path)
     assert over.done.tolist() == [1, 3]
     assert over.failed == {2: "ValueError: no"}

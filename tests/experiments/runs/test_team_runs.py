@@ -10,13 +10,13 @@ from estima import simulate
 from experiments.evaluation.metrics import position_errors_m, rms
 from experiments.gate.candidate import write_recordings
 from experiments.gate.suite import draw_run, read_suite, run_suite
-from experiments.runs.evaluate import evaluate
+from experiments.runs.evaluate import evaluate, scores_of_team, status_of_team
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Outcome, Status
-from experiments.runs.team import scores_of_team, status_of_team
+from experiments.runs.seeds import stream
 from experiments.sweeps.collect import collect
 from experiments.sweeps.launch import sweep
-from experiments.sweeps.plan import plan_of
+from experiments.sweeps.plan import make_plan
 from experiments.viewing.animation import pictures
 from experiments.viewing.estimates import with_estimates
 from experiments.viewing.playback import Playback
@@ -112,7 +112,7 @@ def test_a_team_is_simulated_once_and_a_smaller_one_is_another():
 @pytest.mark.slow
 def test_sweeps_of_teams():
     lines = [*SHORT, "team.size=1,2", "seed=5,6", "estimator.robots=null,robots"]
-    plan = plan_of([*lines, "estimator.kr=1e-5,5e-5"])
+    plan = make_plan([*lines, "estimator.kr=1e-5,5e-5"])
     keys = [int(plan.experiment(i).key, 16) for i in range(len(plan.keys))]
     assert keys == plan.keys.tolist()
     assert len(set(plan.recordings.tolist())) == 4  # by size and seed
@@ -248,3 +248,17 @@ def test_a_suite_may_hold_a_team(tmp_path):
     assert other["fingerprint"].tolist() == again["fingerprint"].tolist()
     assert draw_run(suite, "ekf_slam", 3, tmp_path / "run.png")
     assert write_recordings(suite, tmp_path) == 0
+
+
+def test_each_robot_draws_from_streams_of_its_own(monkeypatch):
+    states = []
+
+    def spy(seed, axis, index=0, **named):
+        rng = stream(seed, axis, index, **named)
+        states.append((axis, str(rng.bit_generator.state)))
+        return rng
+
+    monkeypatch.setattr("experiments.runs.objects.stream", spy)
+    composed("route.distance_m=1").simulate_team()
+    drawn = [state for state in states if state[0] in ("slip", "sensors")]
+    assert len(drawn) == len(set(drawn)) == 4

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from experiments.judging.logs import missing
+from experiments.judging.logs import why_missing
 from experiments.runs.evaluate import evaluate
 from experiments.runs.paths import option_names
 from experiments.runs.row import Outcome
-from experiments.sweeps.plan import planned
+from experiments.sweeps.plan import plan_experiments
 from tests.fixtures.fakes import peers_may_be_missing
 
 STUDIES = option_names("study")
@@ -21,7 +21,7 @@ def shortened(experiment):
     for key, most in (("n_particles", 20), ("n_most", 300), ("n_least", 100)):
         if key in estimator:
             estimator[key] = min(estimator[key], most)
-    return experiment.replaced(route=route, estimator=estimator, repeats=1)
+    return experiment.replace(route=route, estimator=estimator, repeats=1)
 
 
 def runs_of(name, folder):
@@ -30,7 +30,7 @@ def runs_of(name, folder):
         "maximo2024/own": f"data={own_places(folder)}",
         "maximo2024/network": "network._target_=tests.fixtures.fakes.outline",
     }
-    runs = list(planned([f"study={name}", *([given[name]] if name in given else [])]))
+    runs = list(plan_experiments([f"study={name}", *([given[name]] if name in given else [])]))
     return list({run.estimator_name: run for run in reversed(runs)}.values())
 
 
@@ -49,7 +49,7 @@ def test_each_study_fits_together(name, tmp_path):
 def test_each_study_runs(name, tmp_path):
     if name == "decristoforis2020/rawseeds":
         pytest.skip("needs a log of Rawseeds")
-    if name.startswith(("real_logs", "decristoforis2020/log")) and (why := missing()):
+    if name.startswith(("real_logs", "decristoforis2020/log")) and (why := why_missing()):
         pytest.skip(why)
     for experiment in runs_of(name, tmp_path):
         with peers_may_be_missing():

@@ -91,11 +91,11 @@ def test_figures_draw(tmp_path):
 
 
 def test_the_arms_of_a_filter_differ_in_sightings_alone():
-    from experiments.studies.teams.study import _arms, composed
+    from experiments.studies.teams.study import _arms, compose_experiment
 
     for option in settings.WORLDS[next(iter(settings.WORLDS))]:
         arms = [arm for arm, labels in _arms(2, option) if labels["link"] == settings.ALWAYS]
-        first, second = (dataclasses.asdict(composed(0, arm)) for arm in arms)
+        first, second = (dataclasses.asdict(compose_experiment(0, arm)) for arm in arms)
         assert first["config"]["estimator"].pop("robots") is None
         assert second["config"]["estimator"].pop("robots") == "robots"
         assert first == second

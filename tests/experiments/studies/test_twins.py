@@ -31,8 +31,8 @@ def runs(errors=None, spread=0.25, n=50):
 
 
 def verdicts(table):
-    pairs = study.predicted(table)
-    made = [*claims.tw1(pairs, study.of_others(pairs)), *claims.tw2(pairs)]
+    pairs = study.predict_pairs(table)
+    made = [*claims.tw1(pairs, study.held_by_others(pairs)), *claims.tw2(pairs)]
     said = conclude(made, findings("twins"))
     assert [s.id for s in said] == ["TW1", "TW2"]
     assert all(s.sentence.endswith(".") for s in said)
@@ -63,7 +63,7 @@ def test_errors_outside_and_intervals_too_wide_fail():
 
 
 def test_the_interval_of_tau_stays_within_its_range():
-    pairs = study.predicted(runs())
+    pairs = study.predict_pairs(runs())
     pairs.loc[pairs.log == JUDGED[0], "error_m"] = ERRORS_M[::-1]
     found = next(claims.tw2(pairs)).found
     assert -1.0 <= found.low < found.value < found.high == 1.0
@@ -81,5 +81,5 @@ def test_a_twin_that_holds_every_logs_errors_fails():
 
 
 def test_the_figure_has_a_panel_a_log():
-    page = figures.errors(study.predicted(runs(n=5)))
+    page = figures.errors(study.predict_pairs(runs(n=5)))
     assert [ax.get_title() for ax in page.axes][: len(LOGS)] == list(LOGS)

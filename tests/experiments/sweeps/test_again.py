@@ -10,7 +10,7 @@ from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
 from experiments.runs.paths import CONF
 from experiments.runs.store import write_run
-from experiments.sweeps.again import row_of, run_again, short_key
+from experiments.sweeps.again import row_of, run_of_row, short_key
 from experiments.viewing.estimates import with_estimates_by
 from experiments.viewing.playback import Playback
 from sim.errors import InputError
@@ -47,7 +47,7 @@ def test_it_is_the_same_run_whose_picture_is_drawn(results):
     experiment = Experiment.compose([*DRIVE, *RUNS[1]])
     row = row_of(f"mine/{experiment.key}.1")
     assert isinstance(row["estimator.n_particles"], float)
-    again = run_again(row)
+    again = run_of_row(row)
     assert again.experiment.key == experiment.key
     recording = again.recordings().only
     shown = Playback.of(again.recordings(), 5)
@@ -60,19 +60,19 @@ def test_it_is_the_same_run_whose_picture_is_drawn(results):
 def test_another_run_than_the_rows_is_refused(results):
     row = row_of(f"mine/{Experiment.compose([*DRIVE, *RUNS[0]]).key}")
     with pytest.raises(InputError, match="another version of the code, other"):
-        run_again(pd.concat([row.drop("code_version"), pd.Series({"code_version": "other"})]))
+        run_of_row(pd.concat([row.drop("code_version"), pd.Series({"code_version": "other"})]))
     gone = row.copy()
     gone["choice.estimator"] = "nosuch"
     with pytest.raises(InputError, match=r"^estimator/nosuch is not an option.*own\)"):
-        run_again(gone, noted="own")
+        run_of_row(gone, noted="own")
     absent = pd.concat([row, pd.Series({"estimator._target_": "nowhere.Mine"})])
     absent = absent[~absent.index.duplicated(keep="last")]
     with pytest.raises(InputError, match="no module nowhere; is its folder on PYTHONPATH"):
-        run_again(absent)
+        run_of_row(absent)
     changed = row.copy()
     changed["recording_checksum"] = "other"
-    with pytest.raises(InputError, match="not what it was"):
-        run_again(changed).recordings()
+    with pytest.raises(InputError, match="recording has changed"):
+        run_of_row(changed).recordings()
 
 
 def test_own_options_are_found_where_the_sweep_found_them(results, tmp_path):
@@ -82,7 +82,7 @@ def test_own_options_are_found_where_the_sweep_found_them(results, tmp_path):
     option = CONF / "estimator" / "odometry.yaml"
     (tmp_path / "estimator" / "my_odometry.yaml").write_text(option.read_text())
     for given in ({"noted": str(tmp_path)}, {"config_dir": tmp_path, "noted": "gone"}):
-        assert run_again(row, **given).experiment.estimator_name == "my_odometry"
+        assert run_of_row(row, **given).experiment.estimator_name == "my_odometry"
 
 
 def test_view_and_report_draw_runs_of_a_sweep(results, tmp_path):

@@ -12,7 +12,14 @@ from experiments.report.plot import by_factors, sweep_figure
 from experiments.runs.columns import COLUMNS, ORIGIN, REPEAT, STATUS, is_setting, title
 from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
-from experiments.sweeps.collect import collect, measured, suggested, swept, telling, where
+from experiments.sweeps.collect import (
+    collect,
+    distinguishing_settings,
+    result_columns,
+    suggest_axes,
+    swept_settings,
+    where,
+)
 from experiments.sweeps.summary import summary
 from sim.errors import InputError
 
@@ -38,8 +45,8 @@ def rows(n=6):
 
 def test_tables_know_settings_from_findings_and_compare_on_the_same_recordings():
     table = rows()
-    assert swept(table) == ["choice.estimator", "robot.kr", "seed"]
-    assert measured(table) == ["ate_rmse_m", "step_time_us"]
+    assert swept_settings(table) == ["choice.estimator", "robot.kr", "seed"]
+    assert result_columns(table) == ["ate_rmse_m", "step_time_us"]
     found = summary(table, against="a").set_index(["choice.estimator", "robot.kr"])
     np.testing.assert_allclose(found.loc["a", "ate_rmse_over_a"], 1.0)
     np.testing.assert_allclose(found.loc["b", "ate_rmse_over_a"], 2.0)
@@ -55,11 +62,11 @@ def test_settings_that_follow_from_others_are_not_named():
     table = rows()
     table.insert(2, "robot.kl", 2.0 * table["robot.kr"])
     table.insert(3, "estimator._target_", "module." + table["choice.estimator"])
-    assert telling(table) == ["choice.estimator", "robot.kr", "seed"]
+    assert distinguishing_settings(table) == ["choice.estimator", "robot.kr", "seed"]
     assert list(summary(table).columns[:3]) == ["choice.estimator", "robot.kr", "runs"]
     assert set(summary(table)["answer"]) == {"online"}
     table["robot.kl"] = np.tile([1.0, 2.0, 2.0], 4)  # now a setting of its own
-    assert telling(table) == ["choice.estimator", "robot.kr", "robot.kl", "seed"]
+    assert distinguishing_settings(table) == ["choice.estimator", "robot.kr", "robot.kl", "seed"]
 
 
 def test_rows_of_other_code_are_left_out(tmp_path, capsys):
@@ -95,8 +102,8 @@ def test_settings_of_some_estimators_only_are_settings(tmp_path):
             part[f"found_by_{name}"] = 1.0
         part.to_parquet(tmp_path / f"{name}.parquet")
     together = collect(str(tmp_path), all_versions=True)
-    assert {"estimator.metric", "estimator.n_particles"} <= set(swept(together))
-    assert {"found_by_b", "found_by_c"} <= set(measured(together))
+    assert {"estimator.metric", "estimator.n_particles"} <= set(swept_settings(together))
+    assert {"found_by_b", "found_by_c"} <= set(result_columns(together))
     assert (summary(together).groupby("choice.estimator").size() == [2, 4, 4]).all()
 
 
@@ -208,14 +215,14 @@ def test_there_is_no_half_a_seed():
 
 
 def test_what_a_plot_is_drawn_by_is_chosen_where_it_is_not_given():
-    assert suggested(rows()) == ["robot.kr", "choice.estimator"]
-    assert suggested(rows(), ["robot.kr"]) == ["choice.estimator"]
-    assert suggested(rows(), ["robot.kr", "choice.estimator"]) == ["seed"]
-    assert suggested(rows()[:1]) == ["repeat"]
+    assert suggest_axes(rows()) == ["robot.kr", "choice.estimator"]
+    assert suggest_axes(rows(), ["robot.kr"]) == ["choice.estimator"]
+    assert suggest_axes(rows(), ["robot.kr", "choice.estimator"]) == ["seed"]
+    assert suggest_axes(rows()[:1]) == ["repeat"]
     some = rows().assign(**{"choice.world": ["v", "w"] * 6})  # follows from the estimator
     some["estimator.n"] = some["robot.kr"].where(some["choice.estimator"] == "b")
-    assert suggested(many(13))[0] == "choice.estimator"  # more than there are colours
-    assert suggested(some.drop(columns="robot.kr")) == ["choice.estimator", "estimator.n"]
+    assert suggest_axes(many(13))[0] == "choice.estimator"  # more than there are colours
+    assert suggest_axes(some.drop(columns="robot.kr")) == ["choice.estimator", "estimator.n"]
     twice = sweep_figure(rows(), "choice.estimator", "ate_rmse_m", "choice.estimator", pool=True)
     assert len(twice.axes[0].containers) == 2
     with pytest.raises(InputError, match="against itself"):
@@ -236,7 +243,7 @@ def test_the_same_remedy_shows_rows_of_other_code_in_all_three(tmp_path):
 
 def test_versions_of_the_code_are_told_apart():
     both = pd.concat([rows(), rows().assign(code_version="w")], ignore_index=True)
-    assert telling(both)[-1] == "code_version"
+    assert distinguishing_settings(both)[-1] == "code_version"
     assert len(summary(both)) == 2 * len(summary(rows()))
     with pytest.raises(InputError, match=r"code_version \(v, w\).*each code_version"):
         sweep_figure(both, "robot.kr", "ate_rmse_m", "choice.estimator")
@@ -349,7 +356,7 @@ def test_every_column_of_a_row_is_in_the_schema():
     overrides = ["world=rooms", "robot=robocom", "sensors=stereo_pixel", "estimator=smoother"]
     overrides += ["simulation.physics=kinematic", "route.distance_m=12"]
     experiment = Experiment.compose(overrides)
-    (row,) = evaluate(experiment, experiment.simulated)
+    (row,) = evaluate(experiment, experiment.simulate_team)
     others = {name for name in row if not is_setting(name)} - {REPEAT, *STATUS, *ORIGIN}
     assert others <= set(COLUMNS)
     assert {"ate_rmse_m", "rpe_10m_rmse_m", "revised_nees_mean", "step_time_us"} <= others

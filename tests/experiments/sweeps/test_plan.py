@@ -15,16 +15,17 @@ from tests.experiments.sweeps.conftest import SHORT
 
 
 def test_the_last_values_of_a_key_are_swept():
-    found = plan.swept(["seed=range(0,3)", "robot.kr=1e-5,1e-4", "seed=7,8", "a=b"])
+    found = plan.parse_swept(["seed=range(0,3)", "robot.kr=1e-5,1e-4", "seed=7,8", "a=b"])
     assert found == {"seed": [7, 8], "robot.kr": [1e-5, 1e-4], "a": ["a=b"]}
-    assert plan.swept(["seed=range(0,1000000)"])["seed"] == range(1000000)
+    assert plan.parse_swept(["seed=range(0,1000000)"])["seed"] == range(1000000)
     with pytest.raises(InputError, match=r"interval.*lists and ranges"):
-        plan.swept(["robot.kr=interval(0,1)"])
+        plan.parse_swept(["robot.kr=interval(0,1)"])
 
 
 def test_a_million_runs_are_planned_as_each_of_them_alone():
-    every = plan.plan_of(["seed=range(0,1000)", "robot.kr=range(1,101,0.1)", "robot.kl=${robot.kr}",
-                          "simulation.physics=kinematic"])  # fmt: skip
+    kinematic = "simulation.physics=kinematic"
+    slips = ["robot.kr=range(1,101,0.1)", "robot.kl=${robot.kr}"]
+    every = plan.make_plan(["seed=range(0,1000)", *slips, kinematic])
     assert len(every.keys) == len(np.unique(every.keys)) == 10**6
     assert len(every.families) == 1
     for i in (0, 1, 500_123, 999_999):
@@ -34,7 +35,7 @@ def test_a_million_runs_are_planned_as_each_of_them_alone():
             [f"seed={i // 1000}", f"robot.kr={c['robot']['kr']}", "robot.kl=${robot.kr}",
              "simulation.physics=kinematic"]
         )  # fmt: skip
-        assert c == alone.replaced(picture=False).config
+        assert c == alone.replace(picture=False).config
         assert int(alone.key, 16) == every.keys[i]
 
 
@@ -42,7 +43,7 @@ def test_keys_of_a_plan_are_those_of_its_runs(tmp_path):
     given = ["estimator=ekf_icp,ekf_icp_paper", "seed=2,1", "simulation.physics=kinematic,bullet",
              "sensors=lms291", "prior.track_m=null,0.2", "world.n_objects=3,6",
              "estimator.kr=1e-5,1e-4"]  # fmt: skip
-    every = plan.plan_of(given)
+    every = plan.make_plan(given)
     assert len(every.keys) == len(np.unique(every.keys)) == 64
     recordings = {}
     for i, key in enumerate(every.keys):
@@ -56,8 +57,8 @@ def test_keys_of_a_plan_are_those_of_its_runs(tmp_path):
 
 def test_the_quick_composer_resolves_as_hydra_does():
     given = ["world=office", "estimator=ekf_icp,odometry", "sensors=lms291", "robot.kr=1e-6,2e-6"]
-    runs = list(plan.planned([*given, "estimator.window_s=0.1", "study=decristoforis2020/office",
-                               "seed=3,4"]))  # fmt: skip
+    study = ["estimator.window_s=0.1", "study=decristoforis2020/office", "seed=3,4"]
+    runs = list(plan.plan_experiments([*given, *study]))
     assert len(runs) == 2 * 2 * 2
     for run in runs:
         c = run.config
@@ -72,16 +73,18 @@ def test_the_quick_composer_resolves_as_hydra_does():
 
 
 def test_a_study_sweeps_its_own_values_unless_others_are_given():
-    runs = list(plan.planned(["study=decristoforis2020/office"]))
+    runs = list(plan.plan_experiments(["study=decristoforis2020/office"]))
     assert len(runs) == 20 * 4
     assert {run.config["seed"] for run in runs} == set(range(1000, 1020))
-    runs = list(plan.planned(["study=decristoforis2020/office", "seed=1", "estimator=odometry"]))
+    runs = list(
+        plan.plan_experiments(["study=decristoforis2020/office", "seed=1", "estimator=odometry"])
+    )
     assert [run.config["seed"] for run in runs] == [1]
 
 
 def test_unknown_keys_and_options_are_refused():
     with pytest.raises(InputError, match=r"robot\.krr"):
-        list(plan.planned(["robot.krr=1,2"]))
+        list(plan.plan_experiments(["robot.krr=1,2"]))
     refused(called("run", "-m", "robot.krr=1,2"), "robot.krr")
     refused(called("run", "-m", "world=nowhere,room"), "nowhere")
     refused(called("run", "-m", "--frob", "seed=1,2"), "--frob")
@@ -89,8 +92,8 @@ def test_unknown_keys_and_options_are_refused():
 
 def test_keys_depend_on_what_decides_the_rows(tmp_path, monkeypatch):
     experiment = Experiment.compose([])
-    assert experiment.replaced(name="other").key == experiment.key
-    assert experiment.replaced(seed=5).key != experiment.key
+    assert experiment.replace(name="other").key == experiment.key
+    assert experiment.replace(seed=5).key != experiment.key
     monkeypatch.syspath_prepend(str(tmp_path))
     (tmp_path / "package").mkdir()
     for target, source, beside in (
@@ -98,7 +101,7 @@ def test_keys_depend_on_what_decides_the_rows(tmp_path, monkeypatch):
         ("package.part.Mine", "package/part.py", "package/other.py"),  # without an __init__
     ):
         (tmp_path / source).write_text("import helper_of_mine\nclass Mine: pass\n")
-        own = experiment.replaced(estimator={"_target_": target})
+        own = experiment.replace(estimator={"_target_": target})
         keys = [own.key]
         for file in (source, beside):
             (tmp_path / file).write_text("import helper_of_mine\nclass Mine: x = 1\n")
@@ -106,7 +109,7 @@ def test_keys_depend_on_what_decides_the_rows(tmp_path, monkeypatch):
             keys.append(own.key)
         assert len(set(keys)) == 3, target
     with pytest.raises(InputError, match=r"nowhere\.npz"):
-        _ = experiment.replaced(recording="nowhere.npz").recording_key
+        _ = experiment.replace(recording="nowhere.npz").recording_key
 
 
 def test_keys_know_the_files_that_a_mapping_names(tmp_path):
@@ -118,9 +121,9 @@ def test_keys_know_the_files_that_a_mapping_names(tmp_path):
     experiment = Experiment.compose([])
     prior = experiment.config["prior"]
     for changed in (
-        experiment.replaced(recording=named),
-        experiment.replaced(prior={**prior, "map": named}),
-        experiment.replaced(prior={**prior, "map": {"_target_": "x", "f": str(tmp_path)}}),
+        experiment.replace(recording=named),
+        experiment.replace(prior={**prior, "map": named}),
+        experiment.replace(prior={**prior, "map": {"_target_": "x", "f": str(tmp_path)}}),
     ):
         (tmp_path / "a.npy").write_bytes(b"1")
         before = changed.key
@@ -138,24 +141,24 @@ def test_keys_know_the_files_that_an_estimators_options_name(tmp_path, monkeypat
     assert (plain.key, plain.recording_key) == before_files
     feedback = {"_target_": "estimators.odometry.Odometry", "tables": ["none", "a.npz"]}
     named = plain.with_estimator(map_path="a.npz")
-    steered = plain.replaced(route={**plain.config["route"], "feedback": feedback})
+    steered = plain.replace(route={**plain.config["route"], "feedback": feedback})
     swept = ["estimator=topological_mcl", "estimator.map_path=a.npz,b.npz"]
-    old = named.key, steered.key, steered.recording_key, plan.plan_of(swept).keys[0]
+    old = named.key, steered.key, steered.recording_key, plan.make_plan(swept).keys[0]
     (tmp_path / "a.npz").write_bytes(b"2")
-    new = named.key, steered.key, steered.recording_key, plan.plan_of(swept).keys[0]
+    new = named.key, steered.key, steered.recording_key, plan.make_plan(swept).keys[0]
     assert all(a != b for a, b in zip(old, new, strict=True))
-    every = plan.plan_of(swept)
+    every = plan.make_plan(swept)
     assert [int(every.experiment(i).key, 16) for i in range(2)] == every.keys.tolist()
 
 
 def test_packing_keeps_recordings_together():
-    every = plan.plan_of(["repeats=1,2", "seed=range(0,6)"])
-    jobs = plan.packed(every.recordings, 3)
+    every = plan.make_plan(["repeats=1,2", "seed=range(0,6)"])
+    jobs = plan.pack_jobs(every.recordings, 3)
     assert sorted(np.concatenate(jobs)) == list(range(12))
     assert len(jobs) == 3
     for job in jobs:
         assert len({every.experiment(i).seed for i in job}) == 2
-    assert max(len(job) for job in plan.packed(every.recordings, 100)) == 1
+    assert max(len(job) for job in plan.pack_jobs(every.recordings, 100)) == 1
 
 
 def test_only_what_an_estimator_imports_is_of_its_version(tmp_path, monkeypatch):
@@ -194,7 +197,7 @@ def test_wrong_sweeps_end_in_one_line(arguments, words):
 
 
 def test_the_last_value_of_a_key_decides_a_sweeps_own_name():
-    made = plan.plan_of(["seed=0,1"])
+    made = plan.make_plan(["seed=0,1"])
     orders = (["robot.kr=1e-5", "robot.kr=1e-4"], ["robot.kr=1e-4", "robot.kr=1e-5"])
     forward, back = (launch._name(made, ["seed=0,1", *order], None) for order in orders)
     assert forward != back
@@ -231,14 +234,14 @@ def test_what_hydra_would_ignore_is_refused(arguments, words):
 )
 def test_what_cannot_be_planned_is_refused_before_it_is_listed(arguments, words):
     with pytest.raises(InputError, match=words):
-        plan.plan_of(arguments)
+        plan.make_plan(arguments)
 
 
 @pytest.mark.parametrize("sweeps", ["3", "[3]", "[[seed]]"])
 def test_the_sweeps_of_a_study_are_a_list_of_mappings(tmp_path, sweeps):
     option(tmp_path, f"sweeps: {sweeps}")
     with pytest.raises(InputError, match="sweeps must be a list of mappings"):
-        plan.plan_of(["study=own", "seed=0,1"], str(tmp_path))
+        plan.make_plan(["study=own", "seed=0,1"], str(tmp_path))
 
 
 @pytest.mark.parametrize(
@@ -256,7 +259,7 @@ def test_the_sweeps_of_a_study_are_a_list_of_mappings(tmp_path, sweeps):
 def test_a_studys_settings_of_hydra_that_nothing_reads_are_refused(tmp_path, text, is_read):
     option(tmp_path, text)
     if is_read:
-        assert len(plan.plan_of(["study=own"], str(tmp_path)).keys) == 2
+        assert len(plan.make_plan(["study=own"], str(tmp_path)).keys) == 2
         return
     with pytest.raises(InputError, match=r"own\.yaml: .*hydra\.sweeper\.params alone"):
         searched(tmp_path)
@@ -277,7 +280,7 @@ def test_a_sweeps_wrong_settings_of_hydra(argument, words):
 
 
 def test_globs_choose_options():
-    runs = list(plan.planned(["route=glob(linear_*)", "simulation.physics=kinematic"]))
+    runs = list(plan.plan_experiments(["route=glob(linear_*)", "simulation.physics=kinematic"]))
     assert [run.choices["route"] for run in runs] == [f"linear_{i}" for i in range(1, 5)]
 
 
@@ -290,14 +293,14 @@ def test_any_path_can_be_a_value(name):
 
 
 def test_a_missing_value_can_be_given_in_a_sweep(tmp_path):
-    runs = list(plan.planned(["study=maximo2024/own", f"data={tmp_path}", "seed=0,1"]))
+    runs = list(plan.plan_experiments(["study=maximo2024/own", f"data={tmp_path}", "seed=0,1"]))
     assert len(runs) == 2
     assert runs[0].config["recording"]["positions"] == f"{tmp_path}/positions.npy"
 
 
 def test_the_number_of_jobs():
-    runs = plan.plan_of([*QUICK, "seed=range(0,40)"])
-    assert len(plan.packed(runs.recordings, launch._n_jobs(["jobs=20"]))) == 20
+    runs = plan.make_plan([*QUICK, "seed=range(0,40)"])
+    assert len(plan.pack_jobs(runs.recordings, launch._n_jobs(["jobs=20"]))) == 20
     assert launch._n_jobs([]) == launch._n_jobs(["jobs=null"]) > 0
     for wrong in (["jobs=0"], ["jobs=many"], ["jobs=1", "jobs=2"]):
         with pytest.raises(InputError, match="one whole number"):

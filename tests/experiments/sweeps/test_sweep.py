@@ -18,7 +18,7 @@ import pytest
 from experiments.runs import cache, store
 from experiments.runs.experiment import Experiment
 from experiments.runs.paths import results
-from experiments.runs.processes import held_interrupts
+from experiments.runs.processes import hold_interrupts
 from experiments.runs.row import Status, read_rows
 from experiments.runs.store import read_runs
 from experiments.runs.version import source_digest
@@ -222,7 +222,7 @@ def test_an_interrupt_waits_for_the_next_step_and_a_second_one_does_not():
     reached = []
 
     def work():
-        with held_interrupts() as on_step:
+        with hold_interrupts() as on_step:
             on_step(1)
             signal.raise_signal(signal.SIGINT)
             for stop in (on_step, lambda: signal.raise_signal(signal.SIGINT)):
@@ -234,7 +234,7 @@ def test_an_interrupt_waits_for_the_next_step_and_a_second_one_does_not():
         work()
     assert len(reached) == 2
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # as in a worker
-    with held_interrupts():
+    with hold_interrupts():
         signal.raise_signal(signal.SIGINT)
 
 
@@ -351,10 +351,10 @@ def test_a_killed_sweep_comes_to_the_same_table(launcher, tmp_path):
 
 def test_a_job_tried_again_goes_on(tmp_path, monkeypatch):
     """As Ray and SLURM do it, in the midst of a line."""
-    every = plan.plan_of([*QUICK, "seed=range(0,4)"])
+    every = plan.make_plan([*QUICK, "seed=range(0,4)"])
     jobs = launch.Jobs(tmp_path, 1)
     jobs.add(every, np.arange(4))
-    share = json.loads(work.share_of(jobs.plan, 0).read_text())
+    share = json.loads(work.share_path(jobs.plan, 0).read_text())
     ran = []
 
     def run(experiment, _, journal):
@@ -377,7 +377,7 @@ def test_a_job_tried_again_goes_on(tmp_path, monkeypatch):
 
 def test_a_bad_combination_in_a_large_family_fails_alone(tmp_path):
     """Each of its values is sound with the others' first, so no check finds it before."""
-    every = plan.plan_of(
+    every = plan.make_plan(
         [*SHORT, "sensors=hokuyo", "estimator=mcl", "prior.map=world", "seed=range(0,600)",
          "estimator.n_least=100,5000", "estimator.n_most=20000,2000"]
     )  # fmt: skip

@@ -73,17 +73,17 @@ def test_what_was_planted_is_found(twin):
 
 @pytest.mark.slow
 def test_a_twin_predicts_the_error_and_more_slip_is_out_of_its_reach(twin):
-    predicted = [error_m(twin.simulated(seed)) for seed in range(12)]
+    predicted = [error_m(twin.simulate(seed)) for seed in range(12)]
     low, high = min(predicted), max(predicted)
     assert low < error_m(twin.rest) < high
     slippery = {k: 9.0 * getattr(twin.robot, k) for k in ("kr", "kl", "forward_slip_m")}
     worse = dataclasses.replace(twin, robot=dataclasses.replace(twin.robot, **slippery))
-    others = np.array([error_m(worse.simulated(seed)) for seed in range(50, 56)])
+    others = np.array([error_m(worse.simulate(seed)) for seed in range(50, 56)])
     assert np.sum((others > low) & (others < high)) <= 2
 
 
 def test_a_simulation_keeps_to_the_way(twin):
-    made = twin.simulated(3)
+    made = twin.simulate(3)
     assert made.status == "ok"
     assert made.duration_s == pytest.approx(twin.stamps[-1], abs=0.1)
     off = position_errors_m(twin.way, made.truth_at(np.minimum(twin.stamps, made.duration_s)))
@@ -280,6 +280,6 @@ def test_the_walls_of_a_laser_log_are_driven_through_nowhere(tmp_path):
     assert laser.short_share == pytest.approx(0.05, abs=0.03)
     assert laser.missing_share == pytest.approx(0.041, abs=0.02)
     assert laser.sigma_range_m == pytest.approx(0.0104, rel=0.5)
-    made = twin.simulated(0)
+    made = twin.simulate(0)
     assert made.status == "ok"
     assert len(made.log("laser").stamps) == pytest.approx(len(laser.stamps), abs=1)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from experiments.viewing.panels import noted_panels
+from experiments.viewing.panels import read_panels
 from experiments.viewing.plotting import with_legend
 from experiments.viewing.style import save_figure, subplots
 
@@ -18,7 +18,7 @@ def parts(tmp_path):
         with Image.open(tmp_path / "page.png") as image:
             image.load()
             scale, height = image.width / page.bbox.width, image.height
-            text = noted_panels(image)
+            text = read_panels(image)
         found = [
             [tuple(map(int, box.split(","))) for box in part.split("+")] for part in text.split()
         ]

@@ -18,9 +18,9 @@ from estimators.base import Estimate
 from experiments.cli.main import app
 from experiments.trajectories.odometry import write_odometry_csv
 from experiments.viewing import live, movie
-from experiments.viewing.animation import ellipse_outlines, pictures, seen_points
+from experiments.viewing.animation import ellipse_outlines, pictures, sensor_points
 from experiments.viewing.estimates import with_estimates
-from experiments.viewing.playback import Playback, Shown
+from experiments.viewing.playback import Playback, RobotTrack
 from sim import se2
 from sim.errors import InputError
 from sim.recording import save
@@ -48,7 +48,7 @@ def run(recording):
 
 def played(recording, rows, estimate=None):
     """A robot at rows of its Frames."""
-    return Playback((Shown(recording, estimate),), recording.frame_stamps[rows])
+    return Playback((RobotTrack(recording, estimate),), recording.frame_stamps[rows])
 
 
 def believed(recording, poses):
@@ -65,9 +65,9 @@ def test_shown_frames_are_evenly_apart_and_hold_both_ends(recording):
 
 
 def test_the_scan_lies_on_the_walls_of_the_truth(recording):
-    run = Shown(recording)
+    run = RobotTrack(recording)
     for stamp in recording.frame_stamps[[0, 17]]:
-        points = seen_points(run, "laser", stamp)
+        points = sensor_points(run, "laser", stamp)
         assert len(points) == 61
         assert np.allclose(np.abs(points).max(axis=1), HALF_ROOM_M, atol=1e-5)
 
@@ -75,19 +75,19 @@ def test_the_scan_lies_on_the_walls_of_the_truth(recording):
 def test_with_an_estimate_the_scan_goes_where_it_is_believed_to_be(recording):
     shift = np.array([0.3, -0.2, 0.5])
     moved = se2.compose(shift, recording.truth_at(recording.frame_stamps))
-    run = Shown(recording, believed(recording, moved))
-    plain = seen_points(Shown(recording), "laser", 1.0)
-    assert np.allclose(seen_points(run, "laser", 1.0), se2.transform(shift, plain), atol=1e-9)
+    run = RobotTrack(recording, believed(recording, moved))
+    plain = sensor_points(RobotTrack(recording), "laser", 1.0)
+    assert np.allclose(sensor_points(run, "laser", 1.0), se2.transform(shift, plain), atol=1e-9)
 
 
 def test_landmarks_seen_are_the_true_ones(recording):
-    run = Shown(recording)
-    seen = seen_points(run, "stereo", recording.frame_stamps[4])
+    run = RobotTrack(recording)
+    seen = sensor_points(run, "stereo", recording.frame_stamps[4])
     true = recording.truth.world.landmarks[:, :2]
     nearest = np.hypot(*(seen[:, None] - true).transpose(2, 0, 1)).min(axis=1)
     assert len(seen) > 3
     assert np.median(nearest) < 0.4  # a stereo camera errs by some decimetres
-    assert len(seen_points(run, "stereo", -1.0)) == 0
+    assert len(sensor_points(run, "stereo", -1.0)) == 0
 
 
 def test_outlines_lie_on_the_ellipse():

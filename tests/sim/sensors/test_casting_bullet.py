@@ -12,6 +12,7 @@ from sim.robot.bullet import BulletBody
 from sim.robot.drive import DifferentialDrive
 from sim.sensors import Laser, Lidar3D, Mount
 from sim.sensors.rays import BulletRays, ExactRays
+from sim.worlds.world import World
 
 pytestmark = pytest.mark.bullet
 
@@ -43,7 +44,9 @@ def both(request):
     config = yaml.safe_load(WORLDS[request.param].read_text())
     if "path" in config:
         config["path"] = str(ROOT / config["path"])
-    world = make(config, "world", rng=np.random.default_rng(7))
+    rng = np.random.default_rng(7)
+    made = make(config, "world", rng=rng)
+    world = made if isinstance(made, World) else made.build(rng)
     robot = DifferentialDrive(wheel_radius_m=0.05, track_m=0.3)
     with BulletBody(world, robot, world.start_pose) as body:
         larger = ExactRays(stretched(world))

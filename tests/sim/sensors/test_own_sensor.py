@@ -244,7 +244,7 @@ def test_from_the_configuration_to_a_row(tmp_path, monkeypatch):
         ("{_target_: tests.fixtures.beacons.Beacons, reach_m: -3}", "reach_m must be positive"),
         ("{_target_: tests.fixtures.beacons.Nothing}", "has no class Nothing"),
         ("{_target_: tests.fixtures.beacons.BadName}", "'stamps' cannot be the name of a field"),
-        ("{_target_: tests.fixtures.beacons.HiddenRows}", "a ragged field of the truth needs one"),
+        ("{_target_: tests.fixtures.beacons.HiddenRows}", "a ragged truth field needs a measured"),
     ):
         with pytest.raises(InputError, match=words):
             Experiment.compose([f"+sensors.beacons={wrong}", *QUICK]).simulate()

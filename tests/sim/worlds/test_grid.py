@@ -17,7 +17,7 @@ from experiments.runs.seeds import stream
 from sim import se2
 from sim.errors import InputError
 from sim.sensors import Laser
-from sim.worlds.grid import OccupancyGrid, of_world, rasterized
+from sim.worlds.grid import OccupancyGrid, of_world, rasterize
 from sim.worlds.grid_file import image_of, read_grid, write_grid
 from tests.fixtures.fakes import HALF_ROOM_M, circle, square_room
 
@@ -306,7 +306,7 @@ def test_walls_are_borders_in_straight_runs():
 
 
 def test_a_world_as_a_grid():
-    grid = rasterized(square_room(), 0.05, 0.2)
+    grid = rasterize(square_room(), 0.05, 0.2)
     cells = np.argwhere(np.ones(grid.probability.shape, bool))
     middles = grid.middles_m(cells)
     depth = HALF_ROOM_M - np.abs(middles).max(axis=1)  # inside the room, less than 0 outside
@@ -315,11 +315,11 @@ def test_a_world_as_a_grid():
     assert np.all(state[depth > 0.04] == 0.0)
     assert np.isnan(state[depth < -0.04]).all()
     with pytest.raises(InputError, match="height"):
-        rasterized(square_room(), 0.05, 3.0)
+        rasterize(square_room(), 0.05, 3.0)
     with pytest.raises(InputError, match="larger"):
-        rasterized(square_room(), 1e-4, 0.2)
+        rasterize(square_room(), 1e-4, 0.2)
     with pytest.raises(InputError, match="lie in walls"):
-        rasterized(dataclasses.replace(square_room(), start_pose=np.full(3, 99.0)), 0.05, 0.2)
+        rasterize(dataclasses.replace(square_room(), start_pose=np.full(3, 99.0)), 0.05, 0.2)
 
 
 # Localization
@@ -328,7 +328,7 @@ def test_a_world_as_a_grid():
 def test_the_field_is_that_of_the_walls_to_half_a_cell():
     world = square_room()
     exact = likelihood_field(world, LASER, FieldOptions(sigma_m=0.15))
-    ofgrid = likelihood_field(rasterized(world, 0.05, 0.2), LASER, FieldOptions(sigma_m=0.15))
+    ofgrid = likelihood_field(rasterize(world, 0.05, 0.2), LASER, FieldOptions(sigma_m=0.15))
     rng = np.random.default_rng(0)
     ends = np.ascontiguousarray(rng.uniform(-4.0, 4.0, (2, 50)).astype(np.float32))
     here = np.zeros((1, 3))

@@ -18,7 +18,7 @@ from sim.errors import InputError
 from sim.recording import save
 from sim.team import Team
 from sim.worlds.buildings import from_grid
-from sim.worlds.grid import rasterized
+from sim.worlds.grid import rasterize
 from sim.worlds.grid_mapping import _between, map_scans
 from tests.experiments.cli.test_cli import called, refused
 from tests.fixtures.fakes import HALF_ROOM_M, circle, square_room
@@ -53,7 +53,7 @@ def test_the_map_of_a_room(resolution_m):
     assert np.abs(np.abs(middles).max(axis=1) - HALF_ROOM_M).max() < resolution_m
     free = grid.middles_m(np.argwhere(grid.free))
     assert np.abs(free).max() < HALF_ROOM_M
-    inside = rasterized(square_room(), resolution_m, 0.2)
+    inside = rasterize(square_room(), resolution_m, 0.2)
     assert grid.free.sum() > 0.95 * inside.free.sum()
     sides = np.concatenate(
         [[(x, y), (y, x)] for x in np.arange(-3.9, 3.9, 0.1) for y in (-HALF_ROOM_M, HALF_ROOM_M)]
