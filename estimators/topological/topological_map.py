@@ -106,7 +106,7 @@ class TopologicalMap:
         lengths = np.hypot(*(ends[:, 1] - ends[:, 0]).T)
         return float(np.median(lengths[lengths > 0.0])) if np.any(lengths > 0.0) else 0.0
 
-    def transform(self, T_new_old: Array) -> TopologicalMap:
+    def moved(self, T_new_old: Array) -> TopologicalMap:
         """Return the map as seen from another map frame."""
         return dataclasses.replace(
             self,

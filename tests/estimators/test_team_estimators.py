@@ -369,7 +369,7 @@ def test_robots_of_a_team_carry_the_same_sensors():
     team = fake_team(0, n_frames=5)
     priors = priors_of(team)
     other = {**priors[1].sensors, "robots": dataclasses.replace(EYE, rate_hz=2.0)}
-    with pytest.raises(InputError, match="the sensors of robot 1 are not those of robot 0"):
+    with pytest.raises(InputError, match="robot 1 has other sensors than robot 0"):
         EkfSlam().reset_team([priors[0], dataclasses.replace(priors[1], sensors=other)], None)
     bare = {k: v for k, v in priors[0].sensors.items() if k != "robots"}
     with pytest.raises(InputError, match=r"estimator.robots: no sensor named robots"):

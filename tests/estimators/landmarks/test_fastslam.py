@@ -308,7 +308,7 @@ def test_duplicate_ids_and_useless_points_are_rejected_and_reported(recording):
 def test_weights_that_all_underflow_are_told_and_forgotten(recording, monkeypatch):
     image = seen([[0.0, 0.0, 2.0]], [5])
     hopeless = lambda state, n: np.full(n, -np.inf)  # noqa: E731
-    monkeypatch.setattr(fastslam.ekf, "summed", hopeless)
+    monkeypatch.setattr(fastslam.ekf, "log_weights", hopeless)
     estimator, beliefs = stepped(recording, [image, image, image])
     assert beliefs[-1].extras["status"] == "weights underflowed"
     assert np.isfinite(beliefs[-1].mean).all()

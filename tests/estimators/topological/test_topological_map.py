@@ -168,8 +168,8 @@ def test_the_slice_looks_up_rather_than_down():
 def test_moved():
     T = np.array([3.0, -2.0, 0.7])
     known = from_recording(ring_run(), "ring_key", 1.0)
-    moved = known.transform(T)
-    back = moved.transform(se2.inverse(T))
+    moved = known.moved(T)
+    back = moved.moved(se2.inverse(T))
     np.testing.assert_allclose(back.positions_m, known.positions_m, atol=1e-12)
     assert np.hypot(*(moved.positions_m[1] - moved.positions_m[0])) == pytest.approx(
         np.hypot(*(known.positions_m[1] - known.positions_m[0]))

@@ -98,7 +98,7 @@ def test_view_and_report_draw_runs_of_a_sweep(results, tmp_path):
     drawn = []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(
-            "experiments.report.of_sweep.draw_again",
+            "experiments.report.of_sweep.draw_recorded_run",
             lambda row, how, *_: drawn.append(how.out) or "",
         )
         CliRunner().invoke(app, ["report", "mine", "--pictures", "-o", str(page)])
