@@ -278,7 +278,7 @@ def test_false_closures_are_not_believed(laps, monkeypatch):
             found = [*found, planted[-1]]
         return found
 
-    monkeypatch.setattr(GraphSlam, "proposed", with_false_ones)
+    monkeypatch.setattr(GraphSlam, "propose_closures", with_false_ones)
     estimator, online = tracked(laps)
     assert planted
     assert not [edge for edge in planted if edge in estimator.graph.closures]

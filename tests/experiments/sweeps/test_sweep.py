@@ -431,7 +431,7 @@ def test_damaged_files_are_made_again(name):
     assert estima(*swept_).returncode == 0
     expected = table_of(name)
     recordings = [
-        cache.folder() / f"{Experiment.compose([*SHORT, f'seed={seed}']).recording_key}.npz"
+        cache.folder() / f"{Experiment.compose([*SHORT, f'seed={seed}']).recording_key}-0.npz"
         for seed in range(90001, 90005)
     ]
     half = recordings[0].read_bytes()[:5000]
