@@ -23,14 +23,6 @@ from experiments.runs.paths import results
 from sim.errors import InputError
 from tests.experiments.gate.conftest import no_run, of_recordings, table
 
-QUICK = [
-    "world=room",
-    "world.n_landmarks=0",
-    "route.distance_m=2",
-    "simulation.physics=kinematic",
-    "simulation.rays=exact",
-]
-
 
 def verdicts(then, now, name="e"):
     found = regress.compare({"accepted": table(name, then)}, table(name, now), n_draws=20_000)

@@ -23,15 +23,8 @@ from sim.errors import InputError
 from sim.formats import assemble, carmen
 from sim.formats.tum import write_tum
 from sim.team import Team
+from tests.experiments.gate.conftest import QUICK
 from tests.fixtures.fakes import circle
-
-QUICK = [
-    "world=room",
-    "world.n_landmarks=0",
-    "route.distance_m=2",
-    "simulation.physics=kinematic",
-    "simulation.rays=exact",
-]
 
 
 def test_suite_of_the_check_is_sound():
