@@ -174,7 +174,7 @@ def run(*given: Any, estimator: str | Estimator | None = None) -> Run:
     ----------
     given
         A Recording, or none to simulate one (which is then cached in `results/cache`); and
-        overrides, such as `prior.map=world` or `estimator.n_most=2000`.
+        overrides, such as `prior.map=world` or `estimator.max_particles=2000`.
     estimator
         An option such as `ekf_icp`, or any object with `reset` and `step`. By default the one that
         the overrides name, else `odometry`.

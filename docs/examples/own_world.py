@@ -17,6 +17,6 @@ recording = estima.simulate(
     "simulation.physics=kinematic",
     "route.waypoints=[[1, 1], [4, 1], [4, 5], [7, 5]]",  # null: the world's own tour
 )
-run = estima.run(recording, "prior.map=world", "estimator.n_least=200", estimator="mcl")
+run = estima.run(recording, "prior.map=world", "estimator.min_particles=200", estimator="mcl")
 print(f"{recording.status}: position RMSE {run.row['ate_rmse_m']:.3f} m in the known map")
 run.plot("own_world.png")

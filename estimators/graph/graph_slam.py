@@ -73,7 +73,7 @@ class _Placed:
 class GraphSlamOptions(EncoderTickOptions, KeyFrameOptions, MatcherOptions, LoopOptions):
     """Options of graph SLAM."""
 
-    most_gap_m: Positive | None = 1.5
+    max_gap_m: Positive | None = 1.5
     """Leave out a line of which no three points in a row lie this near each other, m: door posts
     far behind one another do not make a wall. null: all lines are kept."""
     gate_probability: Probability | None = 1e-9
@@ -108,7 +108,7 @@ class GraphSlam(GraphSlamOptions):
     def reset(self, prior: Prior, rng: np.random.Generator) -> None:
         """Start from the prior's pose; the first scan becomes a key frame."""
         self._laser, self._rng = prior.require_laser(self.laser, "graph_slam"), rng
-        self._matcher = ScanMatcher(self, self.most_gap_m)
+        self._matcher = ScanMatcher(self, self.max_gap_m)
         self._search = LoopSearch(self._matcher, self._laser, self)
         start = prior.require_start("graph_slam")
         self._wheels = WheelPrediction(self, prior.robot.track_m)

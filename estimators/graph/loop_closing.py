@@ -50,7 +50,7 @@ class LoopOptions:
     """Distance up to which two key frames may see the same place, m."""
     loop_gate_probability: Annotated[float, Field(gt=0.0, le=1.0)] = 1e-3
     """A closure is refused if only this share of all right ones misses the graph by more."""
-    loop_least_gain: NonNegative = 2.0
+    loop_min_gain: NonNegative = 2.0
     """Information about the relative pose that a closure must add online, nats."""
     loop_candidates: Count = 5
     """Older key frames that a new one is registered with, at most."""
@@ -97,7 +97,7 @@ class LoopSearch:
     def worthwhile(self, covariance: Array, noise: Array) -> bool:
         """Whether a measurement of this noise teaches enough about a motion of this covariance."""
         gain = np.linalg.slogdet(noise + covariance)[1] - np.linalg.slogdet(noise)[1]
-        return bool(gain / 2.0 >= self.how.loop_least_gain)
+        return bool(gain / 2.0 >= self.how.loop_min_gain)
 
     def register(
         self, scan: PreparedScan, other: PreparedScan, expected: Gaussian, rng: np.random.Generator

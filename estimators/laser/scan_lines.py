@@ -136,7 +136,7 @@ def prepare(
     return _prepare(ranges, bearings, float(most_m), full)
 
 
-def without_sparse_lines(scan: PreparedScan, most_gap_m: float) -> PreparedScan:
+def without_sparse_lines(scan: PreparedScan, max_gap_m: float) -> PreparedScan:
     """The scan without lines of which no three points in a row lie this near each other.
 
     Edges far behind one another, as of doors in a row, may lie on one line by chance. Seen along
@@ -145,7 +145,7 @@ def without_sparse_lines(scan: PreparedScan, most_gap_m: float) -> PreparedScan:
     on = np.flatnonzero(scan.line_of_point >= 0)
     line = scan.line_of_point[on]
     gaps_m = np.hypot(*np.diff(scan.points[on], axis=0).T)
-    near = (line[1:] == line[:-1]) & (gaps_m <= most_gap_m)
+    near = (line[1:] == line[:-1]) & (gaps_m <= max_gap_m)
     dense = np.zeros(len(scan.lines), dtype=bool)
     dense[line[1:-1][near[1:] & near[:-1]]] = True
     if dense.all():

@@ -141,13 +141,13 @@ class ScanMatcher:
     ----------
     believed
         The method's; those of `Rules` too, if it has them.
-    most_gap_m
+    max_gap_m
         Lines of which no three points in a row lie this near each other are left out; None keeps
         all.
     """
 
     believed: MatcherOptions
-    most_gap_m: float | None = None
+    max_gap_m: float | None = None
 
     @property
     def rules(self) -> Rules:
@@ -157,8 +157,8 @@ class ScanMatcher:
     def prepare(self, ranges_m: ArrayLike, laser: Laser) -> PreparedScan | None:
         """Prepare a scan of this laser; None if it shows too little to be registered."""
         scan = prepare(ranges_m, laser.bearings_rad, laser.max_range_m)
-        if self.most_gap_m is not None:
-            scan = without_sparse_lines(scan, self.most_gap_m)
+        if self.max_gap_m is not None:
+            scan = without_sparse_lines(scan, self.max_gap_m)
         return scan if len(scan.points) >= MIN_POINTS else None
 
     def match(

@@ -219,9 +219,9 @@ def beam_ends(ranges_m: Floats, laser: Laser, n_beams: int) -> Floats:
     return np.ascontiguousarray(ends.T, dtype=np.float32)
 
 
-def _spread(places: Ints, n_most: int) -> Ints:
-    """At most `n_most` of the places, evenly spaced."""
-    n = min(n_most, len(places))
+def _spread(places: Ints, max_particles: int) -> Ints:
+    """At most `max_particles` of the places, evenly spaced."""
+    n = min(max_particles, len(places))
     return places[((np.arange(n) + 0.5) * (len(places) / max(n, 1))).astype(np.int64)]
 
 

@@ -113,16 +113,16 @@ class Bins:
 class MclOptions(WheelOptions, FieldOptions, BinOptions, LaserOptions):
     """Options of Monte Carlo localization."""
 
-    n_least: Count = 1000
+    min_particles: Count = 1000
     """Least number of particles."""
-    n_most: Annotated[int, Field(ge=1, le=_MOST_PARTICLES)] = 20_000
+    max_particles: Annotated[int, Field(ge=1, le=_MOST_PARTICLES)] = 20_000
     """Greatest number of particles, with which it starts."""
     n_beams: Count = 60
     """Beams of each scan that are used, evenly spaced."""
     beam_power: Positive = 0.1
     """Each beam's likelihood is raised to this power, since neighbouring beams err together and
     particles are few for so sharp a likelihood; 1 for independent beams."""
-    least_ess: NonNegative = 0.4
+    min_ess: NonNegative = 0.4
     """A scan counts for less when it would leave less than this share of the particles; below
     `ess_share`."""
     tries: Count = 100
@@ -158,19 +158,21 @@ class MclOptions(WheelOptions, FieldOptions, BinOptions, LaserOptions):
     path."""
 
     def __post_init__(self) -> None:
-        most = max(self.n_most, self.n_rivals)
+        most = max(self.max_particles, self.n_rivals)
         require(
             most * self.tries <= _MOST_TRIES,
-            f"estimator.n_most={self.n_most}, n_rivals={self.n_rivals} and tries={self.tries} draw "
-            f"{most * self.tries} poses at once; at most {_MOST_TRIES} are drawn",
+            f"estimator.max_particles={self.max_particles}, n_rivals={self.n_rivals} and "
+            f"tries={self.tries} draw {most * self.tries} poses at once; at most "
+            f"{_MOST_TRIES} are drawn",
         )
         require(
-            self.n_least <= self.n_most,
-            f"estimator.n_least={self.n_least} is above n_most={self.n_most}",
+            self.min_particles <= self.max_particles,
+            f"estimator.min_particles={self.min_particles} is above "
+            f"max_particles={self.max_particles}",
         )
         require(
-            self.least_ess < self.ess_share,
-            f"estimator.least_ess={self.least_ess} is not below ess_share={self.ess_share}",
+            self.min_ess < self.ess_share,
+            f"estimator.min_ess={self.min_ess} is not below ess_share={self.ess_share}",
         )
 
 
@@ -183,7 +185,7 @@ class Mcl(MclOptions):
 
     The defaults are for finding the robot anywhere: blunt likelihoods and a jitter that widens the
     belief to twice its error or more. A tracker that knows its error wants beam_power=1,
-    least_ess=0, sigma_m of 0.05 to 0.1, and no jitter; it is consistent then.
+    min_ess=0, sigma_m of 0.05 to 0.1, and no jitter; it is consistent then.
 
     Without a start pose the particles are drawn by the first scan, and later ones are injected by
     the current one: along a corridor, where long beams fix the heading closely, a uniform draw
@@ -224,9 +226,9 @@ class Mcl(MclOptions):
         self._off_map = prior.mean is not None and not self._field.holds(prior.mean)
         start, self._everywhere = prior.start, prior.start is None
         if start is None:
-            self._poses = self._field.draw(self.n_most, rng)
+            self._poses = self._field.draw(self.max_particles, rng)
         else:
-            normals = rng.standard_normal((self.n_most, 3))
+            normals = rng.standard_normal((self.max_particles, 3))
             self._poses = start.mean + normals @ root(start.covariance).T
             self._poses[:, 2] = se2.wrap(self._poses[:, 2])
         self._log_weights = np.zeros(len(self._poses))
@@ -277,7 +279,7 @@ class Mcl(MclOptions):
     def _weigh(self, ends: Floats) -> None:
         """Weight by one scan, sum up the belief, and resample if that is due."""
         if self._everywhere:
-            self._poses = self._drawn_by_scan(self.n_most, ends, self._field)
+            self._poses = self._drawn_by_scan(self.max_particles, ends, self._field)
             self._everywhere = False
             self._belief = self._summed_up()
             return
@@ -291,11 +293,11 @@ class Mcl(MclOptions):
             self._draw(share, ends)
 
     def _weighed(self, of_scan: Array) -> Array:
-        """Log weights (M,) with a scan counted by `beam_power`, or by as much as `least_ess` lets.
+        """Log weights (M,) with a scan counted by `beam_power`, or by as much as `min_ess` lets.
 
         The effective sample size falls as the power grows, so the power is found by bisection.
         """
-        least = min(self.least_ess * len(of_scan), effective_sample_size(self._log_weights))
+        least = min(self.min_ess * len(of_scan), effective_sample_size(self._log_weights))
         low, high = 0.0, self.beam_power
         weights = self._log_weights + high * of_scan
         if effective_sample_size(weights) < least:
@@ -365,7 +367,7 @@ class Mcl(MclOptions):
 
     def _draw(self, injected_share: float, ends: Floats) -> None:
         """Resample to as many particles as the bins they fall into call for, and inject others."""
-        n, needed = 0, max(self.n_least, min(len(self._poses), self.n_most) // 4)
+        n, needed = 0, max(self.min_particles, min(len(self._poses), self.max_particles) // 4)
         poses, n_injected = self._poses, 0
         while n < needed:
             n = needed
@@ -374,7 +376,9 @@ class Mcl(MclOptions):
             poses = self._poses[drawn]
             if n_injected > 0:
                 poses = np.concatenate([poses, self._drawn_by_scan(n_injected, ends, self._field)])
-            needed = min(max(self._bins.count_particles(poses), self.n_least), self.n_most)
+            needed = min(
+                max(self._bins.count_particles(poses), self.min_particles), self.max_particles
+            )
         self._poses, self._log_weights = self._jittered(poses), np.zeros(n)
         self._extras["injected"] = n_injected
 

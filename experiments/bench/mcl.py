@@ -89,8 +89,8 @@ def _updates(world: World, poses: Array, frames: list[Frame]) -> tuple[float, fl
     The likelihood is as sharp as a tracker's, and the number of particles is fixed.
     """
     estimator = Mcl(
-        n_least=_N_PARTICLES,
-        n_most=_N_PARTICLES,
+        min_particles=_N_PARTICLES,
+        max_particles=_N_PARTICLES,
         n_beams=_LASER.n_beams,
         beam_power=0.01,
         kr=1e-4,

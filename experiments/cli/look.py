@@ -136,7 +136,7 @@ def view(
 
       estima view run.npz --estimate fastslam -o run.html
 
-      estima view run.npz --estimate mcl prior.map=world estimator.n_most=2000 -o run.mp4
+      estima view run.npz --estimate mcl prior.map=world estimator.max_particles=2000 -o run.mp4
 
       estima view --world world=office seed=3 -o office.png
 

@@ -266,7 +266,7 @@ def test_the_sensors_can_be_chosen():
 OPTIONS = option_names("estimator")
 OPTIONS = [name for name in OPTIONS if not name.endswith("_tuned")]  # other values only
 FEWER = {
-    "mcl": ["estimator.n_most=1000", "estimator.n_least=300"],  # particles; else 20 s
+    "mcl": ["estimator.max_particles=1000", "estimator.min_particles=300"],  # particles; else 20 s
     **fakes.PROGRAMS,
 }
 

@@ -44,7 +44,7 @@ _ORIGIN = np.zeros(3)
 # Chosen when no line was left out yet.
 _OPTIONS: dict[str, Any] = {
     "sigma_range_m": 0.1,
-    "most_gap_m": None,
+    "max_gap_m": None,
     "gate_probability": 1e-6,
     "kr": 1e-3,
     "kl": 1e-3,

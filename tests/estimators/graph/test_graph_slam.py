@@ -48,7 +48,7 @@ def closure(truth, first, second, rng, off=(0.0, 0.0, 0.0)):
 
 
 def search(**changed):
-    how = LoopOptions(**{"loop_least_gain": 1.0} | changed)
+    how = LoopOptions(**{"loop_min_gain": 1.0} | changed)
     return LoopSearch(ScanMatcher(MatcherOptions()), Laser(), how)
 
 
@@ -320,8 +320,8 @@ def test_frames_without_scans_and_before_the_first():
 def test_bad_options_and_no_frames_are_refused():
     with pytest.raises(InputError, match="loop_support"):
         GraphSlam(loop_support=0)
-    with pytest.raises(InputError, match="most_gap_m"):
-        GraphSlam(most_gap_m=0.0)
+    with pytest.raises(InputError, match="max_gap_m"):
+        GraphSlam(max_gap_m=0.0)
     with pytest.raises(InputError, match="shared_noise"):
         GraphSlam(shared_noise=1.0)
     estimator = GraphSlam()

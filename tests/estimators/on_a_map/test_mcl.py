@@ -44,7 +44,7 @@ def errors(beliefs, poses):
 
 def test_tracks():
     poses, frames = drive(ROOM, 100, wheel_noise_m=NOISE_M)
-    beliefs = follow(Mcl(n_most=3000, **WHEELS), frames, prior())
+    beliefs = follow(Mcl(max_particles=3000, **WHEELS), frames, prior())
     off_m, off_rad = errors(beliefs, poses)
     assert off_m.max() < 0.1
     assert off_rad.max() < 0.05
@@ -65,8 +65,8 @@ def test_knows_its_error():
         rng = np.random.default_rng([seed, 1])
         start = rng.multivariate_normal(given.mean, given.covariance)
         sharp = Mcl(
-            n_least=3000, n_most=3000, beam_power=1.0, least_ess=0.0, sigma_m=0.05, cell_m=0.02,
-            jitter_m=0.0, jitter_rad=0.0, **WHEELS,
+            min_particles=3000, max_particles=3000, beam_power=1.0, min_ess=0.0,
+            sigma_m=0.05, cell_m=0.02, jitter_m=0.0, jitter_rad=0.0, **WHEELS,
         )  # fmt: skip
         online = run(sharp, recording, dataclasses.replace(given, mean=start), rng)
         squares.append(nees(recording.truth.poses, online.means, online.covariances)[[29, 59]])
@@ -77,7 +77,7 @@ def test_finds_the_robot_anywhere():
     found = 0
     for seed in range(6):
         poses, frames = drive(ROOM, 80, wheel_noise_m=NOISE_M, seed=seed)
-        beliefs = follow(Mcl(n_most=4000, **WHEELS), frames, prior(start=False), seed)
+        beliefs = follow(Mcl(max_particles=4000, **WHEELS), frames, prior(start=False), seed)
         off_m, off_rad = errors(beliefs, poses)
         found += off_m[40:].max() < 0.2 and off_rad[40:].max() < 0.1
         assert beliefs[0].covariance[0, 0] > 0.01  # and does not claim it from the start
@@ -91,7 +91,7 @@ def test_carried_off(recovery):
     after, more = drive(ROOM, 100, start=[3.8, 3.0, START[2] + math.pi], wheel_noise_m=NOISE_M)
     poses = np.concatenate([poses, after[1:]])
     frames += [dataclasses.replace(frame, stamp=frame.stamp + 4.0) for frame in more[1:]]
-    estimator = Mcl(n_most=4000, recovery=recovery, rival_scans=5, **WHEELS)
+    estimator = Mcl(max_particles=4000, recovery=recovery, rival_scans=5, **WHEELS)
     beliefs = follow(estimator, frames, prior())
     off_m = errors(beliefs, poses)[0]
     assert off_m[:40].max() < 0.15
@@ -114,7 +114,7 @@ def test_people_before_the_laser_are_not_being_lost():
         frames[i] = with_scan(frames[i], ranges)
     injected = {}
     for recovery in ("average", "rivals"):
-        beliefs = follow(Mcl(n_most=4000, recovery=recovery, **WHEELS), frames, prior())
+        beliefs = follow(Mcl(max_particles=4000, recovery=recovery, **WHEELS), frames, prior())
         injected[recovery] = max(b.extras["injected"] for b in beliefs)
         if recovery == "rivals":
             assert errors(beliefs, poses)[0].max() < 0.2
@@ -138,11 +138,11 @@ def test_number_of_particles_follows_fox():
 
 def test_a_scan_is_not_counted_beyond_what_the_particles_bear():
     _, frames = drive(ROOM, 1)
-    estimator = Mcl(n_most=4000, n_least=4000, beam_power=1.0, least_ess=0.25, tries=1)
+    estimator = Mcl(max_particles=4000, min_particles=4000, beam_power=1.0, min_ess=0.25, tries=1)
     wide = dataclasses.replace(prior(), covariance=np.diag([1.0, 1.0, 0.5]))
     belief = follow(estimator, frames, wide)[0]
     assert belief.extras["ess"] == pytest.approx(1000.0, rel=0.05)
-    free = Mcl(n_most=4000, n_least=4000, beam_power=1.0, least_ess=0.0, tries=1)
+    free = Mcl(max_particles=4000, min_particles=4000, beam_power=1.0, min_ess=0.0, tries=1)
     assert follow(free, frames, wide)[0].extras["ess"] < 100.0
 
 
@@ -171,7 +171,7 @@ def test_scans_without_returns_and_none():
     empty = np.full(LASER.n_beams, np.inf)
     frames[20:30] = [with_scan(f, empty) for f in frames[20:30]]
     frames[40:50] = [blind(f) for f in frames[40:50]]
-    beliefs = follow(Mcl(n_most=2000, **WHEELS), frames, prior())
+    beliefs = follow(Mcl(max_particles=2000, **WHEELS), frames, prior())
     told = [i for i, b in enumerate(beliefs) if "status" in b.extras]
     assert told
     assert set(told) <= set(range(20, 30))
@@ -183,7 +183,9 @@ def test_scans_without_returns_and_none():
 
 def test_beliefs_stay_as_they_were_told():
     _, frames = drive(ROOM, 30)
-    estimator = Mcl(n_least=500, n_most=500, ess_share=0.01, least_ess=0.0)  # never resampled
+    estimator = Mcl(
+        min_particles=500, max_particles=500, ess_share=0.01, min_ess=0.0
+    )  # never resampled
     estimator.reset(prior(), np.random.default_rng(0))
     first = estimator.step(frames[0])
     kept = first.extras["particles"].copy()
@@ -194,13 +196,13 @@ def test_beliefs_stay_as_they_were_told():
 
 def test_one_particle():
     _, frames = drive(ROOM, 20)
-    beliefs = follow(Mcl(n_least=1, n_most=1, tries=1), frames, prior())
+    beliefs = follow(Mcl(min_particles=1, max_particles=1, tries=1), frames, prior())
     assert np.isfinite(beliefs[-1].mean).all()
 
 
 def test_conforms():
     recording = circle(3, n_frames=40)
-    checks = check_estimator(lambda: Mcl(n_most=1000), recording, tracking_prior(recording))
+    checks = check_estimator(lambda: Mcl(max_particles=1000), recording, tracking_prior(recording))
     for check in checks:
         assert check.passed, f"{check.name}: {check.message}"
 
@@ -212,10 +214,10 @@ def test_wrong_input_is_named():
     with pytest.raises(InputError, match="map"):
         Mcl().reset(dataclasses.replace(prior(), map=None), rng)
     for options, word in (
-        ({"n_least": 100, "n_most": 50}, "n_least"),
-        ({"least_ess": 0.5, "ess_share": 0.5}, "ess_share"),
-        ({"n_most": 10**12}, "n_most must be a whole number, from 1 to 10000000"),
-        ({"n_most": 10**6, "tries": 10**12}, "tries"),
+        ({"min_particles": 100, "max_particles": 50}, "min_particles"),
+        ({"min_ess": 0.5, "ess_share": 0.5}, "ess_share"),
+        ({"max_particles": 10**12}, "max_particles must be a whole number, from 1 to 10000000"),
+        ({"max_particles": 10**6, "tries": 10**12}, "tries"),
     ):
         with pytest.raises(InputError, match=word):
             Mcl(**options)
@@ -223,4 +225,4 @@ def test_wrong_input_is_named():
         with pytest.raises(
             InputError, match=f"estimator.*{next(iter(options))}=.* bins of the map"
         ):
-            Mcl(n_most=1000, **options).reset(prior(), rng)
+            Mcl(max_particles=1000, **options).reset(prior(), rng)

@@ -33,7 +33,7 @@ def estimate(name, plant, seed=0):
         recording = circle(n_frames=30)
         prior = tracking_prior(recording, with_map=name == "mcl")
     small = {
-        "mcl": ["estimator.n_most=600", "estimator.n_least=300"],
+        "mcl": ["estimator.max_particles=600", "estimator.min_particles=300"],
         "fastslam": ["estimator.n_particles=20"],
         "fastslam_paper": ["estimator.n_particles=20"],
     }

@@ -18,7 +18,7 @@ def shortened(experiment):
     route, estimator = dict(experiment.config["route"]), dict(experiment.config["estimator"])
     if "distance_m" in route:
         route["distance_m"] = 4.0
-    for key, most in (("n_particles", 20), ("n_most", 300), ("n_least", 100)):
+    for key, most in (("n_particles", 20), ("max_particles", 300), ("min_particles", 100)):
         if key in estimator:
             estimator[key] = min(estimator[key], most)
     return experiment.replace(route=route, estimator=estimator, repeats=1)

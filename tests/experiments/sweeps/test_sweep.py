@@ -379,17 +379,17 @@ def test_a_bad_combination_in_a_large_family_fails_alone(tmp_path):
     """Each of its values is sound with the others' first, so no check finds it before."""
     every = plan.make_plan(
         [*SHORT, "sensors=hokuyo", "estimator=mcl", "prior.map=world", "seed=range(0,600)",
-         "estimator.n_least=100,5000", "estimator.n_most=20000,2000"]
+         "estimator.min_particles=100,5000", "estimator.max_particles=20000,2000"]
     )  # fmt: skip
     assert len(every.families) == 1
     launch.check(every, np.arange(2400))
     with store.journal(tmp_path / "rows-0.journal") as journal:
         for i in (1, 3):
             work.run_and_record(every.experiment(i), {}, journal)
-    rows = read_runs(tmp_path).set_index("estimator.n_least")
+    rows = read_runs(tmp_path).set_index("estimator.min_particles")
     assert rows.loc[100, "status"] != "failed"
     assert rows.loc[5000, "status"] == "failed"
-    assert "n_least" in rows.loc[5000, "status_detail"]
+    assert "min_particles" in rows.loc[5000, "status_detail"]
 
 
 @pytest.mark.slow

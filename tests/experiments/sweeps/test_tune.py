@@ -147,10 +147,10 @@ def test_seeds_to_tune_and_to_judge_are_apart(study):
     ],
 )
 def test_wrong_ranges_are_told(settings, complaint):
-    content = {"trials": 2, "seeds": [0], "estimators": {"mcl": {"n_most": settings}}}
+    content = {"trials": 2, "seeds": [0], "estimators": {"mcl": {"max_particles": settings}}}
     with pytest.raises(InputError, match=complaint) as error:
         build(Tuning, content, "study=toy: tune")
-    assert "study=toy: tune.estimators.mcl.n_most" in str(error.value)
+    assert "study=toy: tune.estimators.mcl.max_particles" in str(error.value)
 
 
 @pytest.mark.parametrize(

@@ -377,7 +377,7 @@ def test_mcl_on_a_grid_is_about_as_good_as_on_walls():
             np.diag(np.square([0.05, 0.05, 0.03])),
             known,
         )
-        mcl = Mcl(n_most=3000, kr=1e-5, kl=1e-5)
+        mcl = Mcl(max_particles=3000, kr=1e-5, kl=1e-5)
         found = run(mcl, recording, prior, stream(0, "estimator/mcl"))
         errors.append(np.hypot(*(found.means - recording.truth.poses)[:, :2].T))
     rms = [math.sqrt(np.mean(np.square(error))) for error in errors]
@@ -390,7 +390,7 @@ def test_mcl_conforms_on_a_grid():
     known, sigma = of_world(recording, 0.05, 0.2), np.array([0.02, 0.02, 0.01])
     start = recording.truth.poses[0], np.diag(np.square(sigma))
     prior = Prior(recording.robot, recording.sensors, *start, known)
-    for result in check_estimator(lambda: Mcl(n_most=2000), recording, prior):
+    for result in check_estimator(lambda: Mcl(max_particles=2000), recording, prior):
         assert result.passed, f"{result.name}: {result.message}"
 
 
