@@ -36,6 +36,7 @@ from experiments.sweeps.collect import (
     with_answers,
 )
 from experiments.sweeps.summary import ERROR, summary
+from experiments.sweeps.until import read_decided
 from sim.errors import printable, require
 from sim.files import write_text
 from sim.yaml_file import read_yaml
@@ -87,7 +88,7 @@ def write_sweep_page(
     }
     own = config_dir or noted_config_dir(folder)
     options = f" --config-dir {shlex.quote(str(own))}" if own else ""
-    runs = extremes(table)
+    runs, decided = extremes(table), read_decided(folder)
     found = summary(table)
     means = written(shown(found), HTML, DIGITS)
     drawn_by = list(dict.fromkeys([*telling_apart, REPEAT]))
@@ -99,6 +100,7 @@ def write_sweep_page(
         name=name,
         n_runs=len(table),
         unfinished=unfinished_sweeps(folder),
+        decided=decided,
         controls=_controls(every, drawn_by, settings, metrics),
         filters=[
             (i, each["title"], each["words"])
@@ -108,6 +110,7 @@ def write_sweep_page(
         data=_as_json(
             {
                 "spec": read_yaml(TEMPLATES / "chart.yaml"),
+                "narrowing": _narrowing(decided),
                 "settings": settings,
                 "metrics": [_metric(every[c], c, place) for c in metrics],
                 "revised": (every[PATH] == "revised").astype(int).tolist(),
@@ -139,6 +142,22 @@ def write_sweep_page(
         constant=_constant(table),
     )
     write_text(out, text)
+
+
+def _narrowing(decided: Mapping[str, Any] | None) -> dict[str, Any] | None:
+    """Chart of the intervals of a sweep that ran until it was decided, as Vega-Lite; else None."""
+    if decided is None:
+        return None
+    spec: dict[str, Any] = read_yaml(TEMPLATES / "narrowing.yaml")
+    rows = [
+        {**vars(each), "pair": f"{each.arm} over {each.against}"}
+        for each in decided["comparisons"]
+        if math.isfinite(each.low)
+    ]
+    margin = 1.0 + decided["margin"]
+    spec["params"] = [{"name": "margin", "value": margin}]
+    spec["title"]["text"] = f"{titled(decided['metric'])}, ratio with its interval over all looks"
+    return {**spec, "data": {"values": rows}} if rows else None
 
 
 def _controls(
