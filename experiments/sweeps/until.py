@@ -312,7 +312,7 @@ class _Table:
         place = table["_run"].to_numpy()
         table = table.assign(
             _arm=runs.arm[place], _place=runs.place[place], _recording=runs.recording[place]
-        )
+        ).sort_values(["_arm", "_place"], kind="stable")
         failed = table["status"] == Outcome.FAILED
         if metric not in table or not pd.api.types.is_numeric_dtype(table[metric]):
             raise no_column(table, metric, metric=True)
