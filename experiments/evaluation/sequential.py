@@ -115,10 +115,11 @@ def skewed_bounds(
     error
         Two-sided.
     """
-    root = np.sqrt(n)
-    t, skew = stats.t.isf(np.asarray(error) / 2.0, np.asarray(n) - 1), skewness / root
-    low = -deviation / root * np.maximum(t, _hall(t, skew))
-    high = -deviation / root * np.minimum(-t, _hall(-t, skew))
+    count, root = np.asarray(n, float), np.sqrt(np.asarray(n, float))
+    t, skew = stats.t.isf(np.asarray(error) / 2.0, count - 1.0), np.asarray(skewness) / root
+    scale = np.asarray(deviation, float) / root
+    low = -scale * np.maximum(t, _hall(t, skew))
+    high = -scale * np.minimum(-t, _hall(-t, skew))
     return low, high
 
 
@@ -150,4 +151,4 @@ def power_at(n: int, error: float, effect: float, spread: float) -> float:
 def recordings_for(effect: float, spread: float, power: float = 0.9, error: float = 0.05) -> int:
     """Recordings at which a test that looks once has the power; see `power_at`."""
     z = stats.norm.isf(error / 2.0) + stats.norm.ppf(power)
-    return math.ceil((spread * z / effect) ** 2)
+    return math.ceil(float(spread * z / effect) ** 2)

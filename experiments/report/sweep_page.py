@@ -100,7 +100,7 @@ def write_sweep_page(
         name=name,
         n_runs=len(table),
         unfinished=unfinished_sweeps(folder),
-        decided=decided,
+        decided=decided and {**decided, "metric": titled(decided["metric"])},
         controls=_controls(every, drawn_by, settings, metrics),
         filters=[
             (i, each["title"], each["words"])
@@ -156,7 +156,6 @@ def _narrowing(decided: Mapping[str, Any] | None) -> dict[str, Any] | None:
     ]
     margin = 1.0 + decided["margin"]
     spec["params"] = [{"name": "margin", "value": margin}]
-    spec["title"]["text"] = f"{titled(decided['metric'])}, ratio with its interval over all looks"
     return {**spec, "data": {"values": rows}} if rows else None
 
 

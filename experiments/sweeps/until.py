@@ -199,7 +199,9 @@ class Until:
             here = [arm for arm in arms if arm in alive]
             sound = [arm for arm in here if arm not in table.failed]
             comparisons += [
-                Comparison(0, where, table.names[arm], "", *[math.nan] * 3, Found.FAILED)
+                Comparison(
+                    0, where, table.names[arm], "", math.nan, math.nan, math.nan, Found.FAILED
+                )
                 for arm in here
                 if arm not in sound
             ]
@@ -236,8 +238,9 @@ class Until:
             outcome = Found.BETTER
         elif -near < bounds[0] and bounds[1] < near:
             outcome = Found.EQUAL
-        ratio = [math.exp(v) for v in (found.value, found.low, found.high)]
-        return Comparison(0, where, table.names[arm], table.names[rival], *ratio, outcome)
+        value, low, high = (math.exp(v) for v in (found.value, found.low, found.high))
+        names = table.names[arm], table.names[rival]
+        return Comparison(0, where, *names, value, low, high, outcome)
 
 
 @dataclass(frozen=True)
@@ -387,6 +390,11 @@ def _write(
     write_text(folder / DECIDED, json.dumps(found, indent=1) + "\n")
 
 
+def _comparison(row: Mapping[str, Any]) -> Comparison:
+    known: dict[str, Any] = {key: math.nan if v is None else v for key, v in row.items()}
+    return Comparison(**known | {"found": Found(row["found"])})
+
+
 def read_decided(folder: Path) -> dict[str, Any] | None:
     """Read the comparisons of a sweep that ran until it was decided; None if it did not.
 
@@ -400,13 +408,7 @@ def read_decided(folder: Path) -> dict[str, Any] | None:
         return None
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
-        rows = [
-            Comparison(
-                **{k: math.nan if v is None else v for k, v in row.items()}
-                | {"found": Found(row["found"])}
-            )
-            for row in found["comparisons"]
-        ]
+        rows = [_comparison(row) for row in found["comparisons"]]
         sound = {"metric", "margin", "looks", "made", "total"} <= set(found) and average_of(
             found["metric"]
         ) is not Average.PLAIN

@@ -205,13 +205,15 @@ def test_a_damaged_record_is_named(tmp_path):
 
 
 def test_against_goes_with_a_sweep():
-    refused(estima("run", "--against", "odometry"), "--against odometry: goes with -m and until=decided")
+    done = estima("run", "--against", "odometry")
+    refused(done, "--against odometry: goes with -m and until=decided")
 
 
 def test_a_sweep_ends_when_it_is_decided_and_goes_on_where_it_was(name):
-    """Real runs: the arm that believes ten times the track errs more, and 8 seeds are saved."""
-    arguments = ["run", "-m", *ALONE, "route=angular_4", "estimator=odometry", "prior.track_m=0.19,0.3",
-                 "seed=range(0,20)", "until=decided:heading_rmse_rad", f"name={name}"]  # fmt: skip
+    """Real runs: the arm that believes another track errs more, and 8 seeds are saved."""
+    arguments = ["run", "-m", *ALONE, "route=angular_4", "estimator=odometry",
+                 "prior.track_m=0.19,0.3", "seed=range(0,20)", "until=decided:heading_rmse_rad",
+                 f"name={name}"]  # fmt: skip
     done = estima(*arguments)
     assert done.returncode == 0, done.stderr
     assert "at most 40 runs, 0 of them done before" in done.stderr
