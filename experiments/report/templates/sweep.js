@@ -101,11 +101,12 @@ function draw() {
 }
 
 // The intervals of a sweep that ran until it was decided, in the colours and type of the other chart.
+let drawnNarrowing;
 function drawNarrowing() {
   if (!data.narrowing) return;
   const spec = { ...structuredClone(data.narrowing), config: data.spec.config };
   spec.spec.width = Math.max(120, byId("narrowing").parentElement.clientWidth - 110);
-  vegaEmbed("#narrowing", spec, { ast: true, renderer: "svg", actions: false });
+  drawnNarrowing = vegaEmbed("#narrowing", spec, { ast: true, renderer: "svg", actions: false });
 }
 
 // What a click on a run's dot offers: its picture, or the command that draws it.
