@@ -3,7 +3,6 @@
 import importlib
 import os
 import re
-import sys
 import tempfile
 import time
 from collections import Counter
@@ -23,7 +22,7 @@ from experiments.judging.logs import why_missing
 from experiments.judging.results import Profile, Results
 from experiments.judging.sentences import Conclusion, conclude
 from experiments.report.page import write_report
-from experiments.runs.console import progress
+from experiments.runs.console import progress, show, warn
 from experiments.runs.paths import results, short
 from experiments.viewing.style import save_figure
 from sim.errors import InputError
@@ -59,19 +58,19 @@ def reproduce(*, full: bool = False, only: str | None = None) -> None:
     for paper in _chosen(only):
         begun = time.monotonic()
         if paper in LOGS and (why := why_missing()):
-            print(f"{paper}: left out, {why}", file=sys.stderr)
+            warn(f"{paper}: left out, {why}")
             continue
         conclusions = reproduce_paper(paper, profile)
         for each in conclusions:
-            print(f"{each.id:<4} {each.verdict.label:<15} {first_sentence(each.sentence)}")
+            show(f"{each.id:<4} {each.verdict.label:<15} {first_sentence(each.sentence)}")
         counts = Counter(each.verdict for each in conclusions)
         ruled = ", ".join(
             f"{counts[verdict]} {verdict.label}" for verdict in Verdict if verdict in counts
         )
         lines.append(f"{paper}: {ruled or 'judges no claim'} ({time.monotonic() - begun:.0f} s)")
     page = write_report(place)
-    print("\n".join(["", *lines]))
-    print(f"{short(page)} has the figures and tables behind them; open it in a browser")
+    show("\n".join(["", *lines]))
+    show(f"{short(page)} has the figures and tables behind them; open it in a browser")
 
 
 def redraw(only: str | None = None) -> None:
@@ -92,15 +91,15 @@ def redraw(only: str | None = None) -> None:
     for paper in _chosen(only):
         begun = time.monotonic()
         if paper not in present:
-            print(f"{paper}: left out, no tables in {short(place)}", file=sys.stderr)
+            warn(f"{paper}: left out, no tables in {short(place)}")
             continue
         made = Results(place, paper)
         if paper in LOGS and only is None and not any((place / "arrays").glob(f"{paper}_*.npz")):
-            print(f"{paper}: left out, what it draws of the logs is not here", file=sys.stderr)
+            warn(f"{paper}: left out, what it draws of the logs is not here")
             continue
         with made.blaming_files():
             _draw(made)
-        print(f"{paper}: {time.monotonic() - begun:.0f} s", file=sys.stderr)
+        warn(f"{paper}: {time.monotonic() - begun:.0f} s")
 
 
 def reproduce_paper(paper: str, profile: Profile) -> list[Conclusion]:

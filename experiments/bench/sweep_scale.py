@@ -21,7 +21,7 @@ from experiments.runs.experiment import Experiment
 from experiments.runs.row import Row, Status
 from experiments.sweeps import launch, work
 from experiments.sweeps.collect import collect
-from experiments.sweeps.plan import Family, make_plan, pack_jobs
+from experiments.sweeps.plan import Family, make_plan
 from experiments.sweeps.summary import summary
 
 _NAME = "bench_sweep_scale"
@@ -72,8 +72,8 @@ def _planned() -> tuple[float, list[Path]]:
     runs = np.arange(len(plan.keys))
     launch.check(plan, runs)
     jobs = launch.Jobs(plan.experiment(0).rows_folder, _N_JOBS)
-    for part in pack_jobs(plan.recordings, jobs.count):
-        jobs.add(plan, part)
+    for share in plan.split(runs, jobs.count):
+        jobs.add(*share)
     seconds = time.perf_counter() - begun
     return seconds, [work.share_path(jobs.plan, number) for number in range(len(jobs.sizes))]
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,7 +13,7 @@ from experiments.report.plot import Size, sweep_figure
 from experiments.report.sweep_page import extremes, picture_path, write_sweep_page
 from experiments.report.table import as_lines, notes, statuses, write_table
 from experiments.runs import paths
-from experiments.runs.console import pluralize, progress, show
+from experiments.runs.console import pluralize, progress, show, warn
 from experiments.runs.row import Outcome, write_frame
 from experiments.sweeps.again import draw_recorded_run, short_key
 from experiments.sweeps.collect import collect, folder_of, suggest_axes
@@ -36,7 +35,7 @@ def after_sweep(folder: Path, n_runs: int) -> None:
             reason = why.removeprefix("failed: ")
             often = f"All {len(rows)} runs failed, most often ({count}) so"
             show(f"{often if len(rows) > 1 else 'The run failed'}: {reason}")
-            print(f"\nNext: estima table {folder.name} --rows -o rows.csv  (how each run ended)")
+            show(f"\nNext: estima table {folder.name} --rows -o rows.csv  (how each run ended)")
             return
         means = summary(rows, metrics=[ERROR] if "ate_rmse_m" in rows else [])
         if len(means) <= _FEW_LINES:
@@ -44,7 +43,7 @@ def after_sweep(folder: Path, n_runs: int) -> None:
         estimators = rows.loc[rows["status"] != Outcome.FAILED, "choice.estimator"].unique()
         against = f" --against {estimators[0]}" if len(estimators) > 1 else ""
     name = folder.name
-    print(
+    show(
         f"\nNext: estima table {name}{against} -o table.tex\n      estima plot {name}\n"
         f"      estima report {name}"
     )
@@ -97,7 +96,7 @@ def plot_of(rows: pd.DataFrame, name: str, panels: Panels, out: Path) -> str:
         every = f"all {len(rows)} runs" if len(rows) > 1 else "the run"
         raise InputError(f"{name}: {every} failed; `estima table {name}` says how")
     if failed.any():
-        print(f"{failed.sum()} of {len(rows)} runs failed; left out", file=sys.stderr)
+        warn(f"{failed.sum()} of {len(rows)} runs failed; left out")
         rows = rows[~failed]
     chosen = ""
     if panels.x is None:
@@ -155,4 +154,4 @@ def _draw_extremes(
                 )
             )
         except InputError as error:
-            print(f"{out.name} is not drawn: {error}", file=sys.stderr)
+            warn(f"{out.name} is not drawn: {error}")

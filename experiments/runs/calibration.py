@@ -85,7 +85,7 @@ class Calibration:
     slip: Slip
     sensors: Mapping[str, SensorBelief] = field(default_factory=dict)
 
-    def apply(self, recording: Recording) -> Recording:
+    def apply_to(self, recording: Recording) -> Recording:
         """Return the recording with the log's values replaced by the calibrated ones.
 
         Raises

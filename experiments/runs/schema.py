@@ -162,14 +162,14 @@ def fill(cfg: DictConfig) -> None:
     These are those of the robot, and of each `_target_` of a world, sensor, route and estimator.
     """
     for place in _places(cfg, GROUPS):
-        settings = select(cfg, place)
+        settings = value_at(cfg, place)
         if isinstance(settings, DictConfig):
             with suppress(InputError):  # `check` says it
                 filled = _filled(_target(settings, place), OmegaConf.to_container(settings))  # type: ignore[arg-type]
                 OmegaConf.update(cfg, place, filled, merge=False)
 
 
-def select(cfg: DictConfig, key: str) -> Any:
+def value_at(cfg: DictConfig, key: str) -> Any:
     """What stands at a key; None if it cannot be resolved."""
     return OmegaConf.select(cfg, key, throw_on_resolution_failure=False)
 
@@ -179,7 +179,7 @@ def _places(cfg: DictConfig, groups: Iterable[str]) -> Iterator[str]:
     for group in groups:
         if group != "sensors":
             yield group
-        elif isinstance(sensors := select(cfg, group), DictConfig):
+        elif isinstance(sensors := value_at(cfg, group), DictConfig):
             yield from (f"sensors.{name!s}" for name in sensors)
 
 
@@ -187,7 +187,7 @@ def _target(settings: DictConfig, place: str) -> Callable[..., Any]:
     """What takes the settings of a place."""
     if place == "robot" and "_target_" not in settings:
         return DifferentialDrive
-    return find(select(settings, "_target_"), place)
+    return find(value_at(settings, "_target_"), place)
 
 
 def _filled(target: Callable[..., Any], given: Mapping[str, Any]) -> Config:
@@ -268,7 +268,7 @@ def describe_option(group: str, name: str, searched: Sequence[str] = ()) -> str:
         places = [f"{group}.{only}"]
     parts = []
     for place in places or _places(cfg, [group]):
-        if (settings := select(cfg, place)) is not None:
+        if (settings := value_at(cfg, place)) is not None:
             stated: Config = OmegaConf.to_container(settings)  # type: ignore[assignment]
             title = f"{place}: {stated['_target_']}" if "_target_" in stated else place
             parts.append("\n".join([title, *_said(_target(settings, place), stated)]))

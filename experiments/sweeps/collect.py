@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from difflib import get_close_matches
 from pathlib import Path
@@ -20,7 +19,7 @@ from experiments.runs.columns import (
     STATUS,
     is_setting,
 )
-from experiments.runs.console import pluralize
+from experiments.runs.console import pluralize, warn
 from experiments.runs.paths import results
 from experiments.runs.store import read_runs
 from experiments.runs.version import code_version, version_with
@@ -69,12 +68,12 @@ def collect(name: str, *, all_versions: bool = False, times: bool = False) -> pd
         )
         if not mine.all():
             left_out = pluralize((~mine).sum(), "row")
-            print(f"left out {left_out} of other versions of the code", file=sys.stderr)
+            warn(f"left out {left_out} of other versions of the code")
         table = table[mine]
     for n_runs, command in unfinished_sweeps(path):
         here = pluralize(table["run_key"].nunique(), "run")
         words = f"{here} so far: the sweep of {n_runs} is unfinished; to go on: {command}"
-        print(printable(words), file=sys.stderr)
+        warn(printable(words))
     settings = swept_settings(table)
     _check_distinct(table, settings, path)
     if not times:

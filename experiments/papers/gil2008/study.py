@@ -82,7 +82,7 @@ def plan(profile: Profile) -> Iterator[TableRun]:
         ):
             drawn = one.options_of("recording")
             if drawn["draw"] < n_draws and drawn["image_draw"] <= n_repeats:
-                yield table, one.replace(repeats=min(one.repeats, n_repeats))
+                yield table, one.with_values(repeats=min(one.repeats, n_repeats))
 
 
 def rows_of(runs: Sequence[TableRun]) -> Tables:

@@ -428,7 +428,7 @@ def mapping_run(
         What describes its clouds: a name of `estimators.topological.descriptors.KINDS`, or a
         network as in `described_run`.
     """
-    made = Experiment(config).replace(seed=seed, recording=None).recording()
+    made = Experiment(config).with_values(seed=seed, recording=None).recording()
     if network is not None:
         made = describe_clouds(made, _by_network(network))
     return from_recording(made, descriptor, spacing_m)
@@ -445,7 +445,7 @@ def described_run(config: dict[str, Any], network: dict[str, Any]) -> Recording:
         called with the points.
     """
     return describe_clouds(
-        Experiment(config).replace(recording=None).recording(), _by_network(network)
+        Experiment(config).with_values(recording=None).recording(), _by_network(network)
     )
 
 
