@@ -19,7 +19,7 @@ from experiments.judging.claims_file import (
 )
 from experiments.judging.folders import code_folder, findings
 from experiments.judging.logs import why_missing
-from experiments.judging.results import Profile, Results
+from experiments.judging.results import Profile, Results, reproduce_command
 from experiments.judging.sentences import Conclusion, conclude
 from experiments.report.page import write_report
 from experiments.runs.console import progress, show, warn
@@ -84,9 +84,9 @@ def redraw(only: str | None = None) -> None:
     place = results()
     present = [p for p in _chosen(only) if any((place / "tables").glob(f"{p}_*.csv"))]
     if not present:
-        command = f"estima reproduce --full{f' --paper {only}' if only else ''}"
         raise InputError(
-            f"{short(place / 'tables')}: no tables of {only or 'any paper'}; run `{command}`"
+            f"{short(place / 'tables')}: no tables of {only or 'any paper'}; "
+            f"run `{reproduce_command(only, full=True)}`"
         )
     for paper in _chosen(only):
         begun = time.monotonic()
@@ -137,7 +137,7 @@ def judgement(made: Results) -> tuple[list[Claim], list[Conclusion]]:
 def _write(
     claims: list[Claim], conclusions: list[Conclusion], place: Path, paper: str, profile: Profile
 ) -> None:
-    command = f"estima reproduce --paper {paper}{' --full' * (profile is Profile.FULL)}"
+    command = reproduce_command(paper, full=profile is Profile.FULL)
     write_claims(claims, place / "claims.csv", paper=paper, profile=profile, command=command)
     says = findings(paper)["claims"]
     write_verdicts(conclusions, place / "verdicts.csv", paper=paper, says=says, profile=profile)
@@ -168,7 +168,7 @@ def _put_in_place(new: Path, old: Path, paper: str) -> None:
 def _chosen(only: str | None) -> tuple[str, ...]:
     known = (*PAPERS, *LOGS, *NAMED, *OWN)
     if only is not None and only not in known:
-        raise InputError(f"--paper must be one of {', '.join(known)}, got {only!r}")
+        raise InputError(f"the paper must be one of {', '.join(known)}, got {only!r}")
     return (*PAPERS, *LOGS) if only is None else (only,)
 
 

@@ -1,11 +1,10 @@
-"""The arguments of `estima run`: overrides and options, for one run or a sweep."""
+"""The arguments of `estima run`, and one run by them."""
 
 from __future__ import annotations
 
 import argparse
 import shlex
-import signal
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,6 +14,7 @@ from experiments.runs.compose import name_study_files, open_composer, searched
 from experiments.runs.console import show
 from experiments.runs.experiment import Experiment
 from experiments.runs.run import Draw, run_once
+from experiments.sweeps.commands import config_dir_option
 from sim.errors import InputError, require
 
 
@@ -78,21 +78,11 @@ def run_arguments(arguments: Sequence[str], draw: Draw, out: Path | None = None)
     _say_next(experiment, line)
 
 
-def sweep_arguments(arguments: Sequence[str], on_done: Callable[[Path, int], None]) -> None:
-    """Sweep by a command line's arguments: overrides, and `--config-dir` with its folder."""
-    from experiments.sweeps.launch import sweep
-
-    line = CommandLine.of(arguments)
-    require(not line.shown, "one configuration can be shown, not a sweep; leave out the lists")
-    signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGINT))  # end as by Ctrl-C
-    sweep(line.overrides, line.config_dir, on_done)
-
-
 def _say_next(experiment: Experiment, line: CommandLine) -> None:
     """Say what can be done after a simulated run."""
     if experiment.from_file:
         return
-    options = ["--config-dir", line.config_dir] if line.config_dir else []
+    options = config_dir_option(line.config_dir)
     others = [word for word in line.overrides if word.lstrip("+").partition("=")[0] != "seed"]
     said = shlex.join(["estima", "run", *others, *options])
     show(f"Next: intervals over ten drives: {said} -m 'seed=range(0,10)'")

@@ -28,7 +28,6 @@ from sim.errors import InputError, printable, require
 FEW = 12  # colours, and panels
 _TIMES = ["step_time_us", "cpu_time_us"]  # they differ from run to run
 _COMMAND = "estimator.command"
-COMMAND = "command.txt"  # beside the rows: the commands that made them
 UNFINISHED = "unfinished-{}.txt"  # there until its sweep has ended: how many runs, and its command
 DRAWN = ("seed", "world_seed")  # settings that only draw other samples
 _NAMED = 12  # columns that a message names
@@ -105,12 +104,6 @@ def folder_of(name: str) -> Path:
             return path
     there = sorted(p.name for p in runs.glob("*") if p.is_dir())
     raise InputError(f"no sweep named {name}; there are: {', '.join(there) or 'none'}")
-
-
-def commands(folder: Path) -> list[str]:
-    """Commands that made the rows of a folder, as the sweeps noted them."""
-    path = folder / COMMAND
-    return path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
 
 
 def _check_distinct(table: pd.DataFrame, settings: list[str], path: Path) -> None:

@@ -11,7 +11,6 @@ import os
 import platform
 import re
 import secrets
-import shlex
 import shutil
 import sys
 import threading
@@ -30,7 +29,8 @@ from experiments.runs import paths, store
 from experiments.runs.console import RunFailedError, pluralize, progress, warn
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Outcome, Status
-from experiments.sweeps.collect import COMMAND, UNFINISHED, commands
+from experiments.sweeps.collect import UNFINISHED
+from experiments.sweeps.commands import note_command
 from experiments.sweeps.plan import Numbers, Plan, make_plan
 from experiments.sweeps.work import (
     compiling_file,
@@ -92,7 +92,7 @@ def sweep(
     done = np.isin(keys, store.ended(folder, damaged=_drop).done)
     runs = np.sort(first[~done])
     check(plan, runs)
-    command = _note_command(folder, arguments, config_dir)
+    command = note_command(folder, arguments, config_dir)
     unfinished = folder / UNFINISHED.format(hashlib.sha256(command.encode()).hexdigest()[:8])
     warn(f"{pluralize(len(keys), 'run')}, {done.sum()} of them done before: {paths.short(folder)}")
     if not len(runs):
@@ -115,17 +115,6 @@ def sweep(
     if len(bad):
         why = found.failed.get(int(plan.keys[bad[0]]), "no row was written")
         raise RunFailedError(f"{len(bad)} of {len(keys)} runs; first: {why}")
-
-
-def _note_command(folder: Path, arguments: Sequence[str], config_dir: str | None) -> str:
-    """Keep the command beside the rows, for pages that show them, and return it."""
-    path = folder / COMMAND
-    require_file(path)
-    options = ["--config-dir", config_dir] if config_dir else []
-    command = " ".join(shlex.join(["estima", "run", "-m", *options, *arguments]).splitlines())
-    if command not in (noted := commands(folder)):
-        write_text(path, "\n".join([*noted, command]) + "\n")
-    return command
 
 
 def check(plan: Plan, runs: Numbers) -> None:
