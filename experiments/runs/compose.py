@@ -25,13 +25,12 @@ from experiments.runs.schema import (
     KEYS,
     Config,
     check_shape,
-    describe_unknown,
     describe_unknown_key,
     fill,
     leaves,
     value_at,
 )
-from sim.errors import InputError, require
+from sim.errors import InputError, describe_unknown, require
 from sim.files import write_text
 from sim.yaml_file import read_yaml
 

@@ -10,7 +10,6 @@ from typing import Any
 
 from experiments.runs.row import Row
 from experiments.runs.schema import SIMULATED_KEYS, Config, Leaf, leaves
-from experiments.runs.targets import list_targets
 from experiments.runs.version import SIMULATION, code_version, source_digest, version_with
 from sim.errors import InputError
 from sim.worlds import grid_file
@@ -149,6 +148,14 @@ def _cell(value: Any) -> Any:
     if isinstance(value, int) and not -(2**63) <= value < 2**63:
         return str(value)
     return json.dumps(value) if isinstance(value, (list, tuple)) else value
+
+
+def list_targets(tree: Any) -> set[str]:
+    """Every `_target_` of a configuration."""
+    if not isinstance(tree, Mapping):
+        return set()
+    here = {tree["_target_"]} if isinstance(tree.get("_target_"), str) else set()
+    return here.union(*(list_targets(value) for value in tree.values()))
 
 
 def _recording_sources(config: Config) -> Config:
