@@ -125,7 +125,9 @@ def describe_unknown_key(key: str, config: Mapping[str, Any]) -> str:
             parents, last = parents[:depth], ".".join([*parents[depth:], last])
             break
         config = config[part]
-    return describe_unknown(last, (name for name in config if name != "hydra"), ".".join(parents))
+    return describe_unknown(
+        last, (name for name in config if name not in ("hydra", "_target_")), ".".join(parents)
+    )
 
 
 def leaves(tree: Mapping[str, Any], above: Leaf = ()) -> Iterator[tuple[Leaf, Any]]:

@@ -410,7 +410,8 @@ def recording_from_files(
     if places.ndim != 2 or places.shape[1] != 2:
         raise InputError(f"{positions}: queries need shape (K, 2), got {places.shape}")
     features = read_array(Path(descriptors)).astype(np.float32)
-    return query_recording(places, features, interval_s, stream(config["seed"], "slip"), k=0.0)
+    rng = stream(Experiment(config).seed, "slip")
+    return query_recording(places, features, interval_s, rng, k=0.0)
 
 
 def mapping_run(

@@ -191,7 +191,7 @@ def test_bad_input_is_one_line_and_code_2(arguments, words):
         ("+prior.foo=1", "unknown key prior.foo; known: prior.start, prior.sigma_position_m"),
         (
             "+simulation.foo=1",
-            "unknown key simulation.foo; known: simulation.physics, simulation.rays",
+            "unknown key simulation.foo; known: simulation.physics, sim",
         ),
         ("prior.sigma_heading_rad=-1", "prior.sigma_heading_rad"),
         ("prior.sigma_position_m=true", "prior.sigma_position_m must be .*True"),
