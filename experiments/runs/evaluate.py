@@ -300,7 +300,7 @@ def status_of_team(statuses: Sequence[Status]) -> Status:
 
 
 def scores_of_team(team: Team, scores: Sequence[Row]) -> Row:
-    """The one row of a team's run, of the scores of its robots.
+    """Scores of a team: those of its robots, combined.
 
     Errors are pooled by their squares over all stamps that count. Counts and times of a step add
     up; all else is averaged over the stamps. `worst_robot_rmse_m` comes from the best answers.

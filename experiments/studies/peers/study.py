@@ -118,7 +118,7 @@ def sensor_of(name: str) -> str:
 
 
 def is_ours(name: str) -> bool:
-    """Whether a method is one of this project."""
+    """Whether a method belongs to this project."""
     return name.removesuffix(TUNED) not in PACKAGES
 
 
