@@ -36,8 +36,7 @@ class LogFormat:
     has_name
         Whether a name belongs to a file of its folders and archives.
     has_text
-        Whether a text is of this format: from its beginning, as a whole and by lines without
-        comments.
+        Whether a text has this format, by its beginning, and that as lines without comments.
     n_files
         Least and greatest number of files that a log comes in.
     """
