@@ -81,6 +81,8 @@ def test_options_shows_the_keys_of_one_option():
     assert "gate_probability: null" in shown
     assert called("options", "estimator", "ekf_slam").stdout == shown
     assert "override /estimator: ekf_slam" in called("options", "first_run").stdout
+    listed = called("options", "estimator").stdout.splitlines()
+    assert all(len(line.split()) > 3 for line in listed), "a name and a few words on each"
     refused(called("options", "nosuch"), "no group or option nosuch")
     refused(called("options", "estimator", "nosuch"), "no estimator named nosuch", "ekf_slam")
 

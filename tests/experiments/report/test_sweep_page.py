@@ -117,7 +117,7 @@ def choose(tab, name, value):
 
 
 SAID = "byId('said').textContent"
-Y = "position RMSE, best answer, m"
+Y = "position RMSE, m"
 
 
 def drawn(tab, *names):
