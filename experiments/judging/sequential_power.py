@@ -10,7 +10,6 @@ the log ratio is the judged one, and its spread and smallest effect those of its
 
 import math
 import re
-import sys
 from collections.abc import Callable, Mapping
 
 import numpy as np
@@ -29,7 +28,7 @@ from experiments.judging.claim import SMALLEST_EFFECT, Role
 from experiments.judging.claims_file import read_claims
 from experiments.judging.folders import ROOMS
 from experiments.judging.sequential import designs
-from experiments.runs.console import progress
+from experiments.runs.console import progress, show
 from experiments.runs.paths import SOURCE
 from experiments.runs.seeds import stream
 from sim.arrays import Array
@@ -194,7 +193,7 @@ def main() -> None:
     before, _, rest = page.read_text(encoding="utf-8").partition(_BEGIN)
     after = rest.partition(_END)[2]
     write_text(page, "\n\n".join([f"{before}{_BEGIN}", *parts, f"{_END}{after}"]))
-    print("\n\n".join(parts), file=sys.stderr)
+    show("\n\n".join(parts))
 
 
 if __name__ == "__main__":

@@ -12,7 +12,6 @@ from __future__ import annotations
 import functools
 import json
 import math
-import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from difflib import get_close_matches
@@ -26,6 +25,7 @@ import pandas as pd
 from experiments.evaluation.sequential import SPENT, plan_looks, repeated_interval
 from experiments.evaluation.statistics import Interval
 from experiments.runs.columns import COLUMNS, Average, average_of
+from experiments.runs.console import show, warn
 from experiments.runs.paths import short
 from experiments.runs.row import Outcome
 from experiments.runs.store import read_runs
@@ -173,7 +173,7 @@ class Until:
             table = _Table.of(folder, plan, runs, look, self.metric)
             found, alive = self._decide(table, alive, settled, interval)
             history += [replace(each, seeds=look) for each in found]
-            print(f"{look} of {looks[-1]} seeds: {'; '.join(map(str, found))}", file=sys.stderr)
+            warn(f"{look} of {looks[-1]} seeds: {'; '.join(map(str, found))}")
             _write(folder, self, history, (made, total), looks)
             if not alive:
                 break
@@ -184,7 +184,7 @@ class Until:
             f"{state} after {at} of {looks[-1]} seeds; {total - made} of the {total} runs of all "
             f"seeds saved ({share:.0f} %)"
         ]
-        print("\n".join(lines))
+        show("\n".join(lines))
 
     def _decide(
         self, table: _Table, alive: set[int], settled: set[tuple[int, int]], interval: Measure
