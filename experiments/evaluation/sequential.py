@@ -16,7 +16,7 @@ A confidence sequence needs no largest sample, but betting (Waudby-Smith and Ram
 Stat. Soc. B 86(1)) needs bounded values, and the normal mixture of Robbins (Howard, Ramdas,
 McAuliffe and Sekhon 2021, Ann. Statist. 49(2)), as the t-test e-process of Wang and Ramdas (2024,
 arXiv:2310.03722), pays for looks that are never taken: on 20 to 200 recordings it spends some 2 %
-of the error, and decides the smallest effect half as often. With skewed values it is no safer.
+of the error, and decides the smallest effect in 54 % of cases in place of 86 %.
 `experiments.judging.sequential_power` compares them.
 """
 

@@ -86,15 +86,9 @@ def write_sweep_page(
         path.stem: quote(path.relative_to(out.parent).as_posix())
         for path in _pictures(out).glob("*.html")
     }
-<<<<<<< HEAD
-    own = config_dir or noted_config_dir(folder)
-    options = f" --config-dir {shlex.quote(str(own))}" if own else ""
-    runs, decided = extremes(table), read_decided(folder)
-=======
     given = config_dir_option(config_dir or noted_config_dir(folder))
     options = f" {shlex.join(given)}" if given else ""
-    runs = extremes(table)
->>>>>>> main
+    runs, decided = extremes(table), read_decided(folder)
     found = summary(table)
     means = written(shown(found), HTML, DIGITS)
     drawn_by = list(dict.fromkeys([*telling_apart, REPEAT]))

@@ -159,7 +159,7 @@ class Until:
         )
         known = sorted({family.first.estimator_name for family in plan.families})
         missing = ", ".join(sorted({*self.against} - {*known}))
-        require(not missing, f"--against {missing}: the sweep has {', '.join(known)}")
+        require(not missing, f"against={missing}: the sweep has {', '.join(known)}")
         looks = plan_looks(runs.n_seeds, FIRST_LOOK)
         spent = SPENT / float((arms - 1).sum() * max(len(self.against), 1))
         interval = functools.partial(repeated_interval, looks=looks, spent=spent)

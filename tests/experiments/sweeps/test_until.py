@@ -186,7 +186,7 @@ def test_the_best_of_equal_arms_is_hardly_ever_dropped():
         (["until=decided", "seed=1,2"], "sweep several estimators"),
         (
             ["until=decided", "against=icp", ARMS, "seed=1,2"],
-            "--against icp: the sweep has odometry",
+            "against=icp: the sweep has odometry",
         ),
     ],
 )
