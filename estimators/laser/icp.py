@@ -69,10 +69,9 @@ class Rules:
     and more, corners bend the planes, and registrations of successive scans (721 beams, 1 cm,
     tuning seeds) jump by decimetres now and then."""
     plane: Plane = "matched_point"
-    """What that plane goes through: the `matched_point`, as Chen and Medioni have it and PCL, Open3D
-    and libpointmatcher do, or the `centroid` of the neighbours, which pulls. On noise and corners the
-    centroid lies nearer to the sensor's side than the points, so scans of one pose are registered
-    BIASPLACEHOLDER apart on average."""
+    """What a plane goes through: the `matched_point` (Chen and Medioni; PCL, Open3D and
+    libpointmatcher do the same), or the `centroid` of the neighbours, which in corners and at the
+    ends of walls lies off it: noisy scans of one pose then register BIASPLACEHOLDER."""
 
 
 DEFAULT_RULES = Rules()

@@ -104,9 +104,7 @@ def test_derivatives(metric, rng):
 def test_derivatives_of_point_to_plane(plane, rng):
     """By finite differences of the gradient, with matches, weights and normals held."""
     rules = Rules(plane=plane)
-    found, source, target = registered(
-        ROOM, [0.05, 0.02, 0.03], rng, "point_to_plane", rules=rules
-    )
+    found, source, target = registered(ROOM, [0.05, 0.02, 0.03], rng, "point_to_plane", rules=rules)
     A, by_source, by_target = icp_covariance._censi_planes(found, source, target)
     kept, step = found.inliers, 1e-6
     matches, weights = found.matches[kept], found.weights[kept]
