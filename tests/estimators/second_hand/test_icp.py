@@ -84,6 +84,22 @@ def kabsch(source, target):
     return np.append(b - R @ a, math.atan2(R[1, 0], R[0, 0]))
 
 
+def aligned(scans, of_planes, start, n):
+    """Pose after n iterations of the product, all points alike; planes None: point to point."""
+    surface, many = icp_start.as_segments(scans[1]), len(scans[0].points)
+    planes_at = surface
+    if of_planes is not None:
+        planes_at = surface._replace(normals=of_planes[0], distances_m=of_planes[1])
+    pair = icp_iterations.Pair(*scans, False, of_planes is not None, surface, planes_at, 0.01)
+    every = icp_iterations.Sample(np.arange(many), np.ones(many))
+    plain = icp_iterations.Stage(False, True, math.inf, math.inf, math.inf, 0.0)  # no weights
+    settings = icp_iterations.Settings(n, 0.0, 0.0, 1e-5, 1e-5, 0.0, 0.0)
+    fit = icp_iterations.Fit(np.zeros(many, np.int64), np.zeros(many), np.zeros(many))
+    pose = start.copy()
+    icp_iterations.align(pair, settings, plain, every, start, pose, fit)
+    return pose
+
+
 @pytest.mark.parametrize("arm", ARMS)
 @pytest.mark.parametrize("seed", range(4))
 def test_each_iteration_is_the_printed_one(arm, seed):
@@ -91,28 +107,51 @@ def test_each_iteration_is_the_printed_one(arm, seed):
     target_m, source_m, motion = random_room(rng)
     target, source = cloud(target_m), cloud(source_m)
     scans = [prepare(ranges, BEARINGS_RAD) for ranges in (source_m, target_m)]
-    surface = of_planes = icp_start.as_segments(scans[1])
+    of_planes = None
     if arm != "point_to_point":
-        found = icp_start.planes_of(scans[1].points, 6, through_centroid=arm == "centroid")
-        of_planes = surface._replace(normals=found.normals, distances_m=found.distances_m)
-    pair = icp_iterations.Pair(*scans, False, arm != "point_to_point", surface, of_planes, 0.01)
-    every = icp_iterations.Sample(np.arange(len(source)), np.ones(len(source)))
-    plain = icp_iterations.Stage(False, True, math.inf, math.inf, math.inf, 0.0)  # no weights
+        of_planes = icp_start.planes_of(scans[1].points, 6, through_centroid=arm == "centroid")
     start = motion + np.append(rng.normal(0.0, 0.01, 2), rng.normal(0.0, 0.005))
     for n, expected in enumerate(printed_steps(source, target, start, arm, 8), 1):
-        settings = icp_iterations.Settings(n, 0.0, 0.0, 1e-5, 1e-5, 0.0, 0.0)
-        fit = icp_iterations.Fit(*np.zeros((3, len(source))))._replace(
-            matches=np.zeros(len(source), np.int64)
-        )
-        pose = start.copy()
-        icp_iterations.align(pair, settings, plain, every, start, pose, fit)
-        np.testing.assert_allclose(pose, expected, atol=2e-6)
+        np.testing.assert_allclose(aligned(scans, of_planes, start, n), expected, atol=2e-6)
     if arm == "point_to_point":  # both ways of step 2 come to rest at the same place
         closed = start
         for _ in range(60):
             closed = kabsch(source, target[nearest(moved(closed, source), target)[:, 0]])
         *_, newton = printed_steps(source, target, start, arm, 60)
         np.testing.assert_allclose(newton, closed, atol=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_open3d_puts_its_planes_through_the_matched_points(seed):
+    """Its step of point to plane, over the same matches and normals, is ours."""
+    open3d = pytest.importorskip("open3d", reason="Open3D is not installed")
+    rng = np.random.default_rng([seed, 4])
+    target_m, source_m, motion = random_room(rng)
+    source, target = cloud(source_m), cloud(target_m)
+    scans = [prepare(ranges, BEARINGS_RAD) for ranges in (source_m, target_m)]
+    found = icp_start.planes_of(scans[1].points, 6, through_centroid=False)
+    j = nearest(moved(motion, source), target)[:, 0]
+    # walls of two heights, and a floor in both, hold what the plane leaves free
+    floor = np.column_stack([rng.uniform(-3.0, 3.0, (40, 2)), np.zeros(40)])
+    at = moved(motion, source)
+    clouds = []
+    for walls in (at, target):
+        layers = [np.pad(walls, ((0, 0), (0, 1)), constant_values=z) for z in (-1.0, 1.0)]
+        points = open3d.utility.Vector3dVector(np.concatenate([*layers, floor]))
+        clouds.append(open3d.geometry.PointCloud(points))
+    level = np.pad(found.normals, ((0, 0), (0, 1)))
+    up = np.tile([0.0, 0.0, 1.0], (40, 1))
+    clouds[1].normals = open3d.utility.Vector3dVector(np.concatenate([level, level, up]))
+    n = len(source)
+    pairs = [(i + k * n, j[i] + k * n) for k in range(2) for i in range(n)]
+    pairs += [(2 * n + i, 2 * n + i) for i in range(40)]
+    way = open3d.pipelines.registration.TransformationEstimationPointToPlane()
+    T = way.compute_transformation(*clouds, open3d.utility.Vector2iVector(np.array(pairs)))
+    theirs = T[:2, :2] @ moved(motion, np.zeros((1, 2)))[0] + T[:2, 3]
+    turn = math.atan2(T[1, 0], T[0, 0])
+    np.testing.assert_allclose(
+        aligned(scans, found, motion, 1), [*theirs, motion[2] + turn], atol=1e-5
+    )
 
 
 @pytest.mark.parametrize("arm", ARMS)
