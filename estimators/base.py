@@ -108,7 +108,7 @@ class Belief:
     extras: dict[str, Any] = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Estimate:
     """A trajectory of beliefs.
 
@@ -143,6 +143,9 @@ class Estimate:
     extras: dict[str, list[Any]] = field(default_factory=dict)
     status: str = "ok"
     left_out: str = ""
+
+    def __repr__(self) -> str:
+        return f"Estimate({self.kind}, {len(self.means)} beliefs, {self.status})"
 
 
 Answer = tuple[Estimate, Estimate | None]  # of one robot: online and revised

@@ -87,8 +87,6 @@ def contents(results: Path, on_progress: Callable[[float], None]) -> dict[str, A
         "claims": claims,
         "by_world": by_world(results / "tables" / "leaderboard_means.csv"),
         "first": next((pictures[name] for name in FIRST if name in pictures), None),
-        "titles": {name: page["title"] for name, page in about.items()},
-        "holds_best": papers_holding_best({name: studies[name]["tally"] for name in PAPERS}),
         "on_lasers": on_lasers(results / "tables" / "peers_methods.csv"),
         "n_statistics": len(table),
         "n_judged": table["id"].nunique(),
@@ -108,19 +106,6 @@ def contents(results: Path, on_progress: Callable[[float], None]) -> dict[str, A
         "details": list(dict.fromkeys(key for how in origins.values() for key in how)),
         "unknown": [paper for paper in papers if paper not in made],
     }
-
-
-def papers_holding_best(
-    tallies: Mapping[str, Sequence[tuple[Verdict, int]]],
-) -> list[tuple[str, int, int]]:
-    """The papers of the greatest share of reproduced claims, with their number and that of all."""
-    papers = [
-        (name, dict(counts).get(Verdict.REPRODUCED, 0), sum(n for _, n in counts))
-        for name, counts in tallies.items()
-        if counts
-    ]
-    best = max((held / n for _, held, n in papers), default=0.0)
-    return [entry for entry in papers if best and entry[1] / entry[2] == best]
 
 
 def tally(claims: Iterable[Entry]) -> list[tuple[Verdict, int]]:
