@@ -141,7 +141,7 @@ def places(n: int = 10) -> Iterator[tuple[Laser, Array]]:
 def _same_pose() -> Iterator[Measurement]:
     """Largest mean error of point to plane between noisy scans of one pose, over ten places."""
     means = [
-        same_pose_errors(scan_m, laser, stream(k, "sensors"), _N_SAME_POSE).mean(axis=0)
+        same_pose_errors(scan_m, laser, stream(k, "sensors"), _N_SAME_POSE).mean(axis=(0, 1))
         for k, (laser, scan_m) in enumerate(places())
     ]
     off = np.max(np.abs(means), axis=0)

@@ -128,27 +128,27 @@ def same_pose_errors(
     metric: Metric = "point_to_plane",
     rules: Rules = DEFAULT_RULES,
 ) -> Array:
-    """Errors (n_pairs, 3) m, m, rad, of registering noisy scans of one pose, from the identity.
+    """Errors (n_pairs, 2, 3) m, m, rad, of registering noisy scans of one pose, from the identity.
 
-    Each pair is registered both ways and its errors averaged. The two scans are alike, so either
-    way has the same bias, while most of the noise changes its sign and cancels.
+    Each pair is registered both ways. The two scans are alike, so either way has the same bias,
+    while most of the noise changes its sign and cancels in their mean.
 
     Parameters
     ----------
     ranges_m
         (n_beams,) without noise.
     """
-    errors = np.zeros((n_pairs, 3))
+    errors = np.empty((n_pairs, 2, 3))
     for k in range(n_pairs):
         one, other = (
             prepare(laser.measure(ranges_m, rng), laser.bearings_rad, laser.max_range_m)
             for _ in range(2)
         )
-        for source, target in ((one, other), (other, one)):
+        for way, (source, target) in enumerate(((one, other), (other, one))):
             found = register(
                 source, target, np.zeros(3), metric=metric, gate_m=0.6, gate_rad=0.06, rules=rules
             )
-            errors[k] += found.T_target_source / 2.0
+            errors[k, way] = found.T_target_source
     return errors
 
 
