@@ -93,12 +93,14 @@ class Run:
 
     def __repr__(self) -> str:
         row, prefix = self.row, "" if self.revised is None else "revised_"
-        error_m, nees = row.get(f"{prefix}ate_rmse_m"), row.get(f"{prefix}nees_mean")
+        numbers = {name: value for name, value in row.items() if isinstance(value, float)}
+        error_m, nees = numbers.get(f"{prefix}ate_rmse_m"), numbers.get(f"{prefix}nees_mean")
+        step_us = numbers.get("step_time_us")
         facts = [
-            row["status"] if row["status"] != "ok" else "",
+            str(row["status"]) if row["status"] != "ok" else "",
             "" if error_m is None else f"position RMSE {error_m * 1000.0:.3g} mm",
             "" if nees is None else f"NEES {nees:.3g}",
-            f"{row['step_time_us'] / 1000.0:.3g} ms a step" if "step_time_us" in row else "",
+            "" if step_us is None else f"{step_us / 1000.0:.3g} ms a step",
         ]
         world = row.get("choice.world", "a recording")
         return f"Run({row['choice.estimator']} on {world}: {', '.join(filter(None, facts))})"

@@ -16,7 +16,7 @@ from PIL import Image, UnidentifiedImageError
 from experiments.judging.claim import Role, Verdict, headline_verdict
 from experiments.judging.claims_file import read_claims, read_provenance, read_verdicts, this_code
 from experiments.judging.folders import code_folder, findings
-from experiments.judging.results import Profile
+from experiments.judging.results import Profile, reproduce_command
 from experiments.report.export import as_text, fold_intervals, numeric_columns, plain
 from experiments.report.leaderboard import by_world, on_lasers
 from experiments.runs.paths import CONF
@@ -40,12 +40,12 @@ OWN = {
     ],
     "peers": [
         "pip install 'estima[peers,tune]' && make peers",
-        "estima reproduce --paper peers --full",
+        reproduce_command("peers", full=True),
         "estima tune peers -o conf/estimator",
     ],
     "all_estimators": ["estima run -m study=all_estimators"],
-    "mcl_office": ["estima reproduce --paper mcl_office --full"],
-    "fastslam_consistency": ["estima reproduce --paper fastslam_consistency --full"],
+    "mcl_office": [reproduce_command("mcl_office", full=True)],
+    "fastslam_consistency": [reproduce_command("fastslam_consistency", full=True)],
 }
 FIRST = (
     "real_logs_building",
@@ -64,7 +64,7 @@ def contents(results: Path, on_progress: Callable[[float], None]) -> dict[str, A
     about = {name: findings(name) for name in (*papers, *OWN)}
     sentences = read_verdicts(results / "verdicts.csv").set_index("id")["sentence"].to_dict()
     claims = judged_claims(table, about, sentences)
-    commands = {name: [f"estima reproduce --full --paper {name}"] for name in papers} | OWN
+    commands = {name: [reproduce_command(name, full=True)] for name in papers} | OWN
     commands |= {str(k): list(v.unique()) for k, v in table.groupby("paper")["command"]}
     studies = {}
     for done, (name, page) in enumerate(about.items(), start=1):

@@ -203,7 +203,7 @@ def test_origin_and_command_are_shown(text):
     sections = {e.get("aria-labelledby"): e["text"] for e in Outline(text).all("section")}
     assert "<i>quick profile, 12 s" in sections["puzzlebot2024"]
     assert "<i>fast" in sections["machine"]
-    assert "estima reproduce --full --paper gil2008" in sections["gil2008"]
+    assert "estima reproduce --paper gil2008 --full" in sections["gil2008"]
     assert "world: office" in sections["decristoforis2020"]  # its study's configuration
     assert np.__version__ in sections["machine"]
 
