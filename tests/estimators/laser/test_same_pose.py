@@ -69,13 +69,14 @@ def test_noisy_scans_of_one_pose_are_registered_there_on_average(scenes):
 @pytest.mark.slow
 @NEIGHBOURS
 def test_a_thousand_noisy_pairs_at_ten_places(neighbours):
-    """One way the bias is lost in three standard errors; by both ways it is below the bars."""
+    """One way, all but a mean or two of thirty lie within three standard errors; by both ways the
+    bias, of second order in the noise, is below the bars."""
     scenes = list(places())
     errors = errors_of(scenes, 1000, Rules(neighbours=neighbours))
     means, of_means = biases(errors[:, :, 0])
-    assert np.all(np.abs(means) < 3.0 * of_means)
+    assert np.sum(np.abs(means) > 3.0 * of_means) <= 2
     assert not exceed(errors).any()
     pulled = errors_of(scenes, 100, Rules(neighbours=neighbours, plane="centroid"))
     assert np.mean(exceed(pulled).any(axis=1)) > 0.5
     means, of_means = biases(pulled[:, :, 0])
-    assert np.any(np.abs(means) > 3.0 * of_means)
+    assert np.sum(np.abs(means) > 3.0 * of_means) > 2
