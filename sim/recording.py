@@ -22,7 +22,7 @@ import numpy as np
 from sim.arrays import Array, Ints, Values
 from sim.errors import InputError, require, required
 from sim.files import write_whole
-from sim.log import CommandLog, Log, WheelLog, log_of_readings
+from sim.log import CommandLog, Log, WheelLog, detach, log_of_readings
 from sim.npz import UNREADABLE, read_arrays
 from sim.options import build
 from sim.recording_check import check_recording
@@ -88,7 +88,10 @@ class Truth:
 
 @dataclass(frozen=True)
 class Frame:
-    """One instant at which a sensor fires, without the truth. Its arrays are read-only.
+    """One instant at which a sensor fires, without the truth.
+
+    Its arrays are read-only and hold nothing else: neither readings to come nor what the next
+    estimator sees.
 
     Attributes
     ----------
@@ -203,13 +206,12 @@ class Recording:
         position = self.wheels.at(stamps)
         increments = np.diff(position, axis=0, prepend=position[:1])
         durations = np.diff(stamps, prepend=stamps[:1])
-        increments.setflags(write=False)
         shown = {name: _rows_at(stamps, log).tolist() for name, log in self.logs.items()}
         for i, stamp in enumerate(stamps.tolist()):
             yield Frame(
                 stamp=stamp,
                 duration_s=float(durations[i]),
-                wheel_increments_m=increments[i],
+                wheel_increments_m=detach(increments[i]),
                 readings={
                     name: self.logs[name].reading(rows[i])
                     for name, rows in shown.items()
