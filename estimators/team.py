@@ -13,6 +13,7 @@ from estimators.base import (
     Estimate,
     Journal,
     Prior,
+    detach,
     finish,
     run_and_finish,
     share_processor_time,
@@ -93,10 +94,13 @@ def run_team(
             run_and_finish(make(), recording, prior, rng(number), on_step=tell)
             for number, (recording, prior) in enumerate(zip(team.robots, priors, strict=True))
         ]
+    believed = [prior.robot.wheel_radius_m for prior in priors]
+    own = [one.with_wheel_radius(m) for one, m in zip(team.robots, believed, strict=True)]
+    team = Team(tuple(own))
     begun, n = processor_s(), len(team)
     filters = [make() for _ in range(n if communication.kind == "range" else 1)]
     for number, each in enumerate(filters):
-        each.reset_team(priors, rng(number))
+        each.reset_team(*detach(priors, rng(number), *team.robots))
     of_robots = filters if len(filters) == n else n * filters
     journals = {
         number: Journal(each, recording, on_step=tell)

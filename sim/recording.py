@@ -14,6 +14,7 @@ import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -196,6 +197,15 @@ class Recording:
             self, sensors=_others(self.sensors, name), logs=_others(self.logs, name), truth=truth
         )
 
+    def with_wheel_radius(self, believed_m: float) -> Recording:
+        """Return the recording as read by wheels of this radius: travel in proportion to it."""
+        nominal_m = self.robot.wheel_radius_m
+        if believed_m == nominal_m:
+            return self
+        travel_m = self.wheels.position_m * (believed_m / nominal_m)
+        robot = dataclasses.replace(self.robot, wheel_radius_m=believed_m)
+        return dataclasses.replace(self, wheels=WheelLog(self.wheels.stamps, travel_m), robot=robot)
+
     def frames(self, robot: int = 0) -> Iterator[Frame]:
         """Walk through the Frames in order, as those of the robot of this number.
 
@@ -244,7 +254,7 @@ class Recording:
             found[wide & ~exact] = np.nan
         return found
 
-    @property
+    @cached_property
     def checksum(self) -> str:
         """SHA-256 over all the recording holds, as hex."""
         return digest_of(arrays_of(self), describe(self))

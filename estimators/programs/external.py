@@ -16,6 +16,7 @@ from estimators.programs.program import (
     ProgramError,
     ProgramOptions,
     Seconds,
+    draw_seed,
     explain_mismatch,
     map_message,
 )
@@ -52,7 +53,7 @@ class External(ExternalOptions):
         message = {
             "type": "reset",
             "protocol": PROTOCOL,
-            "seed": int(rng.integers(2**32)),
+            "seed": draw_seed(rng),
             "robot": dataclasses.asdict(prior.robot),
             "sensors": {name: sensor_settings(one) for name, one in prior.sensors.items()},
             "prior": prior.start and vars(prior.start),

@@ -244,6 +244,14 @@ def _quoted(text: bytes | bytearray) -> str:
     return repr(re.sub(r"\s+", " ", bytes(text[:60]).decode(errors="replace")))
 
 
+def draw_seed(rng: np.random.Generator) -> int:
+    """Seed for a program, from which that of the study cannot be got by trying.
+
+    It comes from the generator's seed sequence, which `estimators.base.detach` hides.
+    """
+    return int(rng.bit_generator.seed_seq.generate_state(1)[0])  # type: ignore[attr-defined]
+
+
 def map_message(known_map: Any) -> dict[str, Any] | None:
     """A map as plain arrays: a world's walls and landmarks, or a grid; where it starts is left out.
 

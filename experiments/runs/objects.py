@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import functools
 import sys
@@ -90,7 +91,9 @@ class Objects:
 
     def estimator(self) -> Estimator:
         """Make the estimator: anything with `reset` and `step`."""
-        estimator: Estimator = self.own_estimator or make(self.config["estimator"], "estimator")
+        estimator: Estimator = self.own_estimator or make(
+            copy.deepcopy(self.config["estimator"]), "estimator"
+        )
         for method in ("reset", "step"):
             require(
                 callable(getattr(estimator, method, None)),
@@ -331,9 +334,8 @@ class Objects:
             return None
         if is_grid_file(wanted):
             return grid_file.read_grid(wanted)
-        return required(
-            recording.world, "prior.map=world, but the recording has no map; set prior.map=none"
-        )
+        missing = "prior.map=world, but the recording has no map; set prior.map=none"
+        return required(recording.world, missing).as_map()
 
 
 def _true_start(recording: Recording) -> Array:

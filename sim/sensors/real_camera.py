@@ -7,7 +7,7 @@ import numpy as np
 from sim.arrays import Array, Floats, Ints, Values
 from sim.options import NonNegative, Positive, Share, options
 from sim.sensors.base import Reading, View
-from sim.sensors.stereo import StereoCamera, in_field_of_view, points_in_camera
+from sim.sensors.stereo import StereoCamera, choose, in_field_of_view, points_in_camera
 from sim.worlds.world import World
 
 
@@ -60,6 +60,7 @@ class DetectingEye:
         ids = np.flatnonzero(in_field_of_view(camera, inside) & distant & self._found)
         origin = np.array([*camera.mount.in_map(view.pose)[:2], camera.mount.z_m])
         ids = ids[view.sees(origin, world.landmarks[ids])]
+        ids = choose(camera, ids, inside, rng)
         if not len(ids):
             return None
         reading: dict[str, Values] = {
