@@ -353,7 +353,7 @@ class Journal:
         """
         i = self._n_noted
         try:
-            self._means[i], self._covariances[i] = _read_belief(belief, self._who)
+            self._means[i], self._covariances[i] = read_belief(belief, self._who)
         except BeliefError as error:
             require(i > 0, str(error))
             raise BeliefError(f"{error}, at {frame.stamp:.2f} s, step {i}") from error
@@ -379,7 +379,7 @@ class Journal:
         )
 
 
-def _read_belief(belief: Any, who: str) -> tuple[Array, Array]:
+def read_belief(belief: Any, who: str) -> tuple[Array, Array]:
     """Mean (3,) and covariance (3, 3) of what `step` returned."""
     wanted = "step must return a Belief with a mean of shape (3,) and a covariance of shape (3, 3)"
     if not isinstance(belief, Belief):

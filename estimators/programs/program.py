@@ -164,6 +164,10 @@ class Program:
         if code != 0:
             raise self._error("failed")
 
+    def spent_s(self) -> float:
+        """Processor time that it has taken so far, s; without that of processes it started."""
+        return time.clock_gettime((~self._process.pid << 3) | 2)  # CPUCLOCK_SCHED of a process
+
     def close(self, patience_s: float = _PATIENCE_S) -> float:
         """Let it end, with its whole process group; return the processor time that it took, s.
 
