@@ -16,6 +16,7 @@ import yaml
 from omegaconf import OmegaConf
 
 from estimators.base import Estimator, Prior
+from experiments.gate.cheats import find_cheats
 from experiments.runs.experiment import Experiment
 from experiments.runs.seeds import stream
 from experiments.runs.targets import make
@@ -288,6 +289,7 @@ _CHECKS: Mapping[str, Callable[[Make, Recording, Prior], str]] = {
     "same seed, same bits": _repeatable,
     "causal": _causal,
     "frames untouched": _untouched,
+    "only its Frames": find_cheats,
     "reset": _reset,
     "equivariant": _equivariant,
     "missing sensor": _missing,

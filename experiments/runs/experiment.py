@@ -186,8 +186,8 @@ class Experiment(Objects):
         stream(config["world_seed"], "world", key="world_seed")
         require(
             not self.isolated or (self.own_estimator is None and self.team is None),
-            "isolated=true runs an estimator of one robot, named by estimator._target_; an object in "
-            "memory and those of a team run in this process",
+            "isolated=true runs an estimator of one robot that estimator._target_ names; an object "
+            "in memory and those of a team run in this process",
         )
         self._check_team()
         self._check_needs()
