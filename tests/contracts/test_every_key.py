@@ -5,23 +5,13 @@ made again, as short as can be. The tables say where a key acts that does not ac
 and which keys decide no result, with the reason.
 """
 
-import hashlib
-import itertools
 import types
 from collections.abc import Iterable
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
-import numpy as np
 import pytest
-from omegaconf import OmegaConf
 
-from experiments.runs.evaluate import evaluate
-from experiments.runs.experiment import Experiment
-from experiments.runs.paths import CONF
-from experiments.runs.schema import leaves
-from sim.errors import InputError
 from sim.options import find
-from sim.recording import arrays_of, digest_of
 
 pytestmark = pytest.mark.slow
 
