@@ -160,9 +160,11 @@ def test_lines_that_hold_something_else_are_refused(line):
     ],
 )
 def test_a_child_that_says_nonsense_fails(answer, said, tmp_path, monkeypatch):
-    lines = f"while read -r line; do case $line in *frame*) echo '{answer}';; *) echo '{{}}';; esac; done"
     child = tmp_path / "child"
-    child.write_text(f"#!/bin/sh\n{lines}\n")
+    child.write_text(
+        "#!/bin/sh\nwhile read -r line; do\n"
+        f"case $line in *frame*) echo '{answer}';; *) echo '{{}}';; esac\ndone\n"
+    )
     child.chmod(0o755)
     monkeypatch.setattr(sys, "executable", str(child))
     experiment = Experiment.compose([*DRIVE, "isolated=true"])
