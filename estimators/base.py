@@ -11,7 +11,7 @@ from typing import Any, Literal, Protocol, TypeVar
 import numpy as np
 
 from estimators.gaussian import Gaussian
-from sim.arrays import Array
+from sim.arrays import Array, Bools
 from sim.compiled import processor_s, wall_s
 from sim.errors import InputError, require, required
 from sim.formats.trajectory import FARTHEST_M, sound_covariances
@@ -406,7 +406,7 @@ def explain_unsound(estimate: Estimate) -> str:
     shapes = np.shape(stamps), np.shape(means), np.shape(covariances)
     if shapes != ((n,), (n, 3), (n, 3, 3)):
         return "stamps, means and covariances of shapes {}, {} and {}".format(*shapes)
-    checks = {
+    checks: dict[str, Bools] = {
         "stamp is not after the last": np.diff(stamps, prepend=-np.inf) > 0.0,
         "mean is not finite": np.isfinite(means).all(axis=1),
         f"mean is farther away than {FARTHEST_M:g} m": ~(np.abs(means) > FARTHEST_M).any(axis=1),
@@ -416,7 +416,7 @@ def explain_unsound(estimate: Estimate) -> str:
     }
     given = np.isfinite(means).all(axis=1) & np.isfinite(covariances).all(axis=(1, 2))
     for fault, sound in checks.items():
-        faulty = ~sound & (given | (estimate.status == "ok"))
+        faulty = ~sound if estimate.status == "ok" else ~sound & given
         if faulty.any():
             step = int(np.argmax(faulty))
             return f"the {fault} at {stamps[step]:.2f} s, step {step}"

@@ -106,8 +106,12 @@ class Isolated(External):
 
     def __init__(self, settings: Mapping[str, Any], keep: Collection[str] = ()) -> None:
         code = f"import sys; sys.path[:] = {sys.path!r}; import {__name__} as h; h.main()"
-        limits = {"start_s": _LIMIT_S, "step_s": _LIMIT_S, "finish_s": _LIMIT_S}
-        super().__init__(command=[sys.executable, "-c", code], **limits)
+        super().__init__(
+            command=[sys.executable, "-c", code],
+            start_s=_LIMIT_S,
+            step_s=_LIMIT_S,
+            finish_s=_LIMIT_S,
+        )
         self._settings, self._keep = dict(settings), [*keep, "status"]
 
     def _introduce(self, prior: Prior, rng: np.random.Generator) -> dict[str, Any]:

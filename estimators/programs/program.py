@@ -253,7 +253,7 @@ def draw_seed(rng: np.random.Generator) -> int:
 
     It comes from the generator's seed sequence, which `estimators.base.detach` hides.
     """
-    return int(rng.bit_generator.seed_seq.generate_state(1)[0])  # type: ignore[attr-defined]
+    return int(rng.bit_generator.seed_seq.generate_state(1)[0])
 
 
 def map_message(known_map: Any) -> dict[str, Any] | None:

@@ -73,7 +73,8 @@ def _run(
 ) -> Beliefs:
     """Means and covariances over baited Frames."""
     estimator = new()
-    rng = np.random.Generator(np.random.PCG64(_Seeds(entropy)))
+    seeds: Any = _Seeds(entropy)
+    rng = np.random.Generator(np.random.PCG64(seeds))
     estimator.reset(_baited_map(prior, recording, toured), rng)
     beliefs = [estimator.step(frame) for frame in _baited_frames(recording)]
     if hasattr(estimator, "finish"):

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sim.arrays import Array
+from sim.arrays import Array, Bools
 from sim.errors import InputError, require, required
 from sim.files import read_head
 from sim.formats.rosbag import Track
@@ -80,7 +80,7 @@ def check_track(track: Track, path: Path) -> None:
         )
 
 
-def sound_covariances(covariances: Array) -> Array:
+def sound_covariances(covariances: Array) -> Bools:
     """Which of covariances (T, 3, 3) are finite, symmetric and without a negative variance.
 
     Rounding is let pass: 1e-3 of the two standard deviations, or of the greatest variance.
