@@ -11,7 +11,7 @@ from typing import Any, Literal, Protocol, TypeVar
 import numpy as np
 
 from estimators.gaussian import Gaussian
-from sim.arrays import Array, Bools
+from sim.arrays import Array
 from sim.compiled import processor_s, wall_s
 from sim.errors import InputError, require, required
 from sim.formats.trajectory import FARTHEST_M, sound_covariances
@@ -406,9 +406,10 @@ def explain_unsound(estimate: Estimate) -> str:
     shapes = np.shape(stamps), np.shape(means), np.shape(covariances)
     if shapes != ((n,), (n, 3), (n, 3, 3)):
         return "stamps, means and covariances of shapes {}, {} and {}".format(*shapes)
-    checks: dict[str, Bools] = {
+    finite = np.isfinite(means) & np.isfinite(stamps)[:, None]
+    checks: dict[str, Any] = {
         "stamp is not after the last": np.diff(stamps, prepend=-np.inf) > 0.0,
-        "mean is not finite": np.isfinite(means).all(axis=1),
+        "mean is not finite": finite.all(axis=1),
         f"mean is farther away than {FARTHEST_M:g} m": ~(np.abs(means) > FARTHEST_M).any(axis=1),
         "covariance is not finite, symmetric and positive semidefinite": (
             sound_covariances(covariances)

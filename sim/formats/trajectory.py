@@ -97,7 +97,7 @@ def sound_covariances(covariances: Array) -> Bools:
     a, d, f = (variances + (_ROUNDING * variances.max(axis=1) + 1e-12)[:, None]).T
     b, c, e = ((known[:, i, j] + known[:, j, i]) / 2.0 for i, j in ((0, 1), (0, 2), (1, 2)))
     minor = a * d - b * b
-    found: Array = (
+    found: Bools = (
         sound & (minor > 0.0) & (f * minor - a * e * e + 2.0 * b * c * e - d * c * c > 0.0)
     )
     return found

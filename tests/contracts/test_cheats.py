@@ -183,9 +183,6 @@ def test_no_walk_leads_to_the_recording(case):
     for found in Walker.arrays:
         assert not any(np.shares_memory(found, array) for array in logs.values())
         assert found.shape != recording.truth.poses.shape
-        assert (
-            found.size <= max(v[0].size for v in logs.values() if v.ndim == 2) or found.size < 500
-        )
     assert 123_456_789 not in Walker.seeds
     planted = stream(123_456_789, "estimator/walker").bit_generator.seed_seq
     assert planted.entropy == 123_456_789  # what the walk would find without `detach`
