@@ -1,6 +1,7 @@
 """How a team's estimators run: what each knows of the other robots, and when."""
 
 import dataclasses
+import functools
 import itertools
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Literal
@@ -15,6 +16,7 @@ from estimators.base import (
     Prior,
     detach,
     finish,
+    run,
     run_and_finish,
     share_processor_time,
     walk,
@@ -91,8 +93,9 @@ def run_team(
     tell = None if on_step is None else lambda _: on_step(next(count))
     if communication.kind == "never":
         return [
-            run_and_finish(make(), recording, prior, rng(number), on_step=tell)
-            for number, (recording, prior) in enumerate(zip(team.robots, priors, strict=True))
+            run_and_finish(one, functools.partial(run, one, *of_robot, rng(number), on_step=tell))
+            for number, of_robot in enumerate(zip(team.robots, priors, strict=True))
+            for one in [make()]
         ]
     believed = [prior.robot.wheel_radius_m for prior in priors]
     own = [one.with_wheel_radius(m) for one, m in zip(team.robots, believed, strict=True)]

@@ -18,6 +18,7 @@ from estimators.base import (
     Estimator,
     Prior,
     explain_unsound,
+    run,
     run_and_finish,
 )
 from estimators.team import run_team
@@ -174,7 +175,9 @@ def run_over(
     and the matrices of filters are small.
     """
     with limit_blas():
-        return run_and_finish(estimator, recording, prior, rng, keep, on_step)
+        return run_and_finish(
+            estimator, lambda: run(estimator, recording, prior, rng, keep, on_step)
+        )
 
 
 def limit_blas() -> AbstractContextManager[object]:
@@ -308,7 +311,7 @@ def status_of_team(statuses: Sequence[Status]) -> Status:
 
 
 def scores_of_team(team: Team, scores: Sequence[Row]) -> Row:
-    """The one row of a team's run, of the scores of its robots.
+    """Scores of a team: those of its robots, combined.
 
     Errors are pooled by their squares over all stamps that count. Counts and times of a step add
     up; all else is averaged over the stamps. `worst_robot_rmse_m` comes from the best answers.
