@@ -200,7 +200,7 @@ class Experiment(Objects):
         estimator = self._named_estimator()
         if is_ours(settings):
             # its values too; one from elsewhere may take long to make
-            estimator = self.replace(isolated=False).estimator()
+            estimator = self.with_values(isolated=False).estimator()
         needs = frozenset(getattr(estimator, "needs", ()))
         if not self.from_file:
             self._check_sensors(f"estimator={self.estimator_name}", needs - {"map"}, settings)

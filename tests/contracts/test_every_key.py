@@ -45,7 +45,7 @@ def others(value, kind):
         tried = [value * 2, value * 0.5, value + 1, value + 0.1, value - 1, 3, 0.3, -value, 0]
         return [other for other in tried if other != value]
     if isinstance(value, list) and all(isinstance(v, (int, float)) for v in value):
-        return [[type(v)(2 * v) for v in value]]
+        return [[type(v)(2 * v + (v == 0)) for v in value]]
     return [0.5, 2, 33.0, 0.01, [0.5, 1.0], "true", [[1, 1], [3, 1], [3, 3]]]
 
 

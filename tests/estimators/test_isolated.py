@@ -86,7 +86,7 @@ def test_results_are_those_of_this_process(name):
 )
 def test_code_from_elsewhere_runs_in_the_child_only(kind, status, said, tmp_path, monkeypatch):
     monkeypatch.delitem(sys.modules, "my_own_method", raising=False)
-    experiment = Experiment.compose([*DRIVE, "estimator=odometry", "isolated=true"]).replace(
+    experiment = Experiment.compose([*DRIVE, "estimator=odometry", "isolated=true"]).with_values(
         estimator={"_target_": "my_own_method.Mine", "kind": kind}
     )
     (tmp_path / "my_own_method.py").write_text(MINE)
@@ -105,7 +105,7 @@ def test_what_it_refuses_is_refused(tmp_path, monkeypatch):
         ({"kind": "refuses"}, "it takes no such map"),
         ({"kinds": 1}, "does not accept its values"),
     ):
-        one = experiment.replace(estimator={"_target_": "my_own_method.Mine", **settings})
+        one = experiment.with_values(estimator={"_target_": "my_own_method.Mine", **settings})
         with pytest.raises(InputError, match=said):
             evaluate(one)
     with pytest.raises(InputError, match="object in memory"):
