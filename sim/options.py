@@ -126,7 +126,7 @@ def options(where: str) -> Callable[[type[T]], type[T]]:
 
 
 @functools.cache
-def _option_names(cls: type) -> frozenset[str]:
+def _option_names(cls: Any) -> frozenset[str]:
     """Names of the fields of all classes of options that a class inherits."""
     inherited: list[Any] = [base for base in cls.__mro__ if "_options_place" in vars(base)]
     return frozenset(name for base in inherited for name in base.__dataclass_fields__)
@@ -137,7 +137,8 @@ def _set_state(self: Any, name: str, value: Any) -> None:
 
     The dataclass's own goes through every class that is inherited: 4 us a value, in every step.
     """
-    if name in _option_names(type(self)) or "_options_place" in vars(type(self)):
+    cls: Any = type(self)
+    if name in _option_names(cls) or "_options_place" in vars(cls):
         raise dataclasses.FrozenInstanceError(f"cannot assign to field {name!r}")
     object.__setattr__(self, name, value)
 
