@@ -175,8 +175,13 @@ def show(text: str) -> None:
     _write("\n".join(map(printable, text.split("\n"))), sys.stdout)
 
 
-def _say(message: str, code: int) -> NoReturn:
+def warn(message: str) -> None:
+    """Print one line to standard error, with what may come from a file made printable."""
     _write(printable(" ".join(f"estima: {message}".splitlines())), sys.stderr)
+
+
+def _say(message: str, code: int) -> NoReturn:
+    warn(message)
     sys.exit(code)
 
 

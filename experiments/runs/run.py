@@ -22,7 +22,7 @@ from experiments.runs.compose import (
     open_composer,
     searched,
 )
-from experiments.runs.console import RunFailedError, progress, show
+from experiments.runs.console import RunFailedError, progress, show, warn
 from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
 from experiments.runs.processes import hold_interrupts
@@ -100,16 +100,29 @@ def run_once(experiment: Experiment, draw: Draw, out: Path | None = None) -> lis
             on_estimate=keep,
             on_error=_trace,
         )
-    if found and experiment.config["picture"]:
-        draw(found, experiment, folder)
+    written = (write_run(rows, folder.parent), folder / "run.png", out)
     if found and out is not None:
         write_estimate(out, found[0][1])
-    written = (write_run(rows, folder.parent), folder / "run.png", out)
+    if found and experiment.config["picture"]:
+        _draw(draw, found, experiment, folder)
     _print(rows, [file for file in written if file is not None and file.exists()])
     for row in rows:
         if row["status"] == Outcome.FAILED:
             raise RunFailedError(f"{row['status_code']}: {row['status_detail']}")
     return rows
+
+
+def _draw(
+    draw: Draw, found: Sequence[tuple[Recording, Estimate]], experiment: Experiment, folder: Path
+) -> None:
+    """Draw a run whose results are on disk; a picture that fails is a warning."""
+    try:
+        draw(found, experiment, folder)
+    except InputError:  # a full disk, say
+        raise
+    except Exception as error:
+        (folder / "run.png").unlink(missing_ok=True)  # of a run before
+        warn(f"the picture is not drawn ({type(error).__name__}: {error}); the results are kept")
 
 
 def expected_duration_s(experiment: Experiment) -> float | None:
