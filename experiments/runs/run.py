@@ -18,7 +18,6 @@ from experiments.runs.columns import COLUMNS, REVISED
 from experiments.runs.compose import (
     CommandLine,
     check_hydra,
-    name_study_files,
     open_composer,
     searched,
 )
@@ -158,8 +157,8 @@ def application(arguments: Sequence[str], draw: Draw, out: Path | None = None) -
     """
     line = CommandLine.of(arguments)
     check_hydra(line.overrides)
-    with open_composer(searched(line.config_dir)) as composer:
-        found = composer.compose(name_study_files(line.overrides))
+    with open_composer([*searched(line.config_dir), *line.overrides]) as composer:
+        found = composer.compose(composer.words)
     if line.shown:
         print(OmegaConf.to_yaml(found.cfg, resolve=line.resolved))
         return

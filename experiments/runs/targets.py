@@ -1,6 +1,7 @@
-"""Objects that a configuration names by `_target_`."""
+"""Objects that a configuration names by `_target_`, and the code that it names at all."""
 
 import inspect
+import json
 from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
@@ -77,3 +78,17 @@ def list_targets(tree: Any) -> set[str]:
         return set()
     here = {tree["_target_"]} if isinstance(tree.get("_target_"), str) else set()
     return here.union(*(list_targets(value) for value in tree.values()))
+
+
+def named_code(tree: Any) -> set[str]:
+    """Every `_target_` and `command` in mappings and lists; commands as a row has them."""
+    if isinstance(tree, (list, tuple)):
+        return set().union(*map(named_code, tree))
+    if not isinstance(tree, Mapping):
+        return set()
+    here = {
+        value if isinstance(value, str) else json.dumps(value, default=str)
+        for key, value in tree.items()
+        if key in ("_target_", "command") and value not in (None, "???")  # given later
+    }
+    return here.union(*map(named_code, tree.values()))

@@ -105,7 +105,9 @@ def _figure_alone(recording: Recording, estimate: Estimate, name: str) -> Figure
     sound = np.isfinite(means).all(axis=1) & np.isfinite(estimate.covariances).all(axis=(1, 2))
     along = travelled_m(means[sound])
     some = np.searchsorted(along, np.linspace(0.0, along[-1], _N_ELLIPSES + 1)[1:])
-    some = np.flatnonzero(sound)[np.unique(np.minimum(some, sound.sum() - 1))] if sound.any() else []
+    some = (
+        np.flatnonzero(sound)[np.unique(np.minimum(some, sound.sum() - 1))] if sound.any() else []
+    )
     draw_ellipses(
         map_axes, means[some], estimate.covariances[some], "95 % ellipse",
         ec=ESTIMATE, fc=ESTIMATE, alpha=0.35, lw=0.8, zorder=3,
