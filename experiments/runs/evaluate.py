@@ -24,6 +24,7 @@ from experiments.evaluation.metrics import (
 from experiments.runs.columns import OF_THE_RUN, REVISED, Average, average_of
 from experiments.runs.experiment import Experiment
 from experiments.runs.objects import Objects
+from experiments.runs.processes import is_interrupt
 from experiments.runs.row import GAP, Outcome, Row, Status
 from experiments.runs.seeds import stream
 from sim.arrays import Array
@@ -50,7 +51,7 @@ def evaluate(
     planted: Planted | None = None,
     shown: Shown | None = None,
     on_estimate: Callable[[Recording, int, Estimate, Estimate | None], None] = lambda *_: None,
-    on_error: Callable[[Exception | SystemExit], None] = lambda _: None,
+    on_error: Callable[[BaseException], None] = lambda _: None,
 ) -> list[Row]:
     """Run an experiment's estimator `repeats` times over its recordings, and score each run.
 
@@ -107,7 +108,9 @@ def evaluate(
                 status, scores = status_of_team(statuses), scores_of_team(read, every)
         except InputError:
             raise
-        except (Exception, SystemExit) as error:
+        except BaseException as error:
+            if is_interrupt(error):
+                raise
             status = Status.of_error(error)
             on_error(error)
         else:

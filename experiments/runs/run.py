@@ -144,7 +144,7 @@ def record(experiment: Experiment, out: Path) -> bool:
     return all(robot.status == "ok" for robot in made.robots)
 
 
-def _trace(error: Exception | SystemExit) -> None:
+def _trace(error: BaseException) -> None:
     """Print where an error came from, unless it is a program's, whose own message says so."""
     if not isinstance(error, ProgramError):
         traceback.print_exception(error)

@@ -5,7 +5,7 @@ import json
 from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
-from sim.errors import InputError, require
+from sim.errors import InputError, blaming, require
 from sim.options import find
 
 
@@ -29,12 +29,13 @@ def make(settings: Mapping[str, Any], where: str, **injected: Any) -> Any:
     function = check_target(settings, where, injected)
     arguments = {key: value for key, value in settings.items() if key != "_target_"}
     known = inspect.signature(function).parameters
-    try:
-        return function(**arguments, **{k: v for k, v in injected.items() if k in known})
-    except (TypeError, ValueError) as error:
-        raise InputError(
-            f"{where} ({settings['_target_']}) does not accept its values: {error}"
-        ) from error
+    with blaming(f"{where} ({settings['_target_']})"):
+        try:
+            return function(**arguments, **{k: v for k, v in injected.items() if k in known})
+        except (TypeError, ValueError) as error:
+            raise InputError(
+                f"{where} ({settings['_target_']}) does not accept its values: {error}"
+            ) from error
 
 
 def check_target(

@@ -14,7 +14,7 @@ from typing import Any
 from experiments.runs import store
 from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
-from experiments.runs.processes import hold_interrupts
+from experiments.runs.processes import hold_interrupts, is_interrupt
 from experiments.runs.row import Row, Status, check_row
 from experiments.sweeps.plan import Family
 from sim.team import Team
@@ -85,7 +85,9 @@ def run_and_record(experiment: Experiment, held: dict[str, Team], journal: store
             )
             for row in rows:
                 check_row(row)
-        except (Exception, SystemExit) as error:
+        except BaseException as error:
+            if is_interrupt(error):
+                raise
             rows = [failure_row(experiment, Status.of_error(error))]
     journal.append(rows)
 
