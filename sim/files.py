@@ -48,7 +48,7 @@ def read_text(path: Path, most_bytes: int) -> str:
     try:
         with path.open("rb") as file:
             content = file.read(most_bytes + 1)
-        require(len(content) <= most_bytes, f"{path}: longer than {most_bytes} bytes")
+        require(len(content) <= most_bytes, f"{path}: longer than {most_bytes} bytes; remove it")
         return content.decode("utf-8-sig")
     except OSError as error:
         raise InputError(f"{path}: cannot read ({error.strerror}); check its name") from error

@@ -62,6 +62,8 @@ def _describe(group: str, name: str, config_dir: Path | None) -> None:
     """Print an option's keys; a study states its own."""
     from experiments.runs.compose import searched
     from experiments.runs.schema import describe_option
+    from sim.files import read_text
+    from sim.yaml_file import MOST_BYTES
 
     names = completion.options(group, config_dir)
     known = f"no {group} named {name}; there are: {', '.join(names)}"
@@ -69,7 +71,7 @@ def _describe(group: str, name: str, config_dir: Path | None) -> None:
     if group == "study":
         files = (folder / group / f"{name}.yaml" for folder in (config_dir, paths.CONF) if folder)
         path = next(file for file in files if file.exists())
-        show(path.read_text(encoding="utf-8").rstrip())
+        show(read_text(path, MOST_BYTES).rstrip())
     else:
         show(describe_option(group, name, searched(config_dir)))
 

@@ -98,14 +98,32 @@ for _name, _command in _COMMANDS.items():
 
 def main() -> None:
     """Run the command line; wrong input ends in one line and code 2, a failed run in code 1."""
+    _open_closed_streams()
     try:
-        app(_own_first(sys.argv[1:]))
+        try:
+            Path.cwd()
+        except OSError:
+            gone = "the current folder is gone, or may not be entered; cd to another"
+            raise InputError(gone) from None
+        try:
+            app(_own_first(sys.argv[1:]))
+        finally:
+            sys.stdout.flush()
     except (Exception, KeyboardInterrupt) as error:
         exit_with(error)
     except SystemExit as ended:
         if ended.code == _INTERRUPTED:  # Typer has caught the interrupt, which may hold a message
             exit_with(ended)
         raise
+
+
+def _open_closed_streams() -> None:
+    """Give whoever closed a standard stream the null device, lest a file takes its number."""
+    while (number := os.open(os.devnull, os.O_RDWR)) <= 2:
+        pass
+    os.close(number)
+    sys.stdout = sys.stdout or os.fdopen(1, "w")
+    sys.stderr = sys.stderr or os.fdopen(2, "w")
 
 
 def _own_first(arguments: list[str]) -> list[str]:

@@ -36,6 +36,7 @@ from sim.team import Team
 _ADDED = ("stamps_scored", "stamps_left_out", "step_time_us")  # over the robots
 _STREAMS = 100  # of a run's filters
 REMARKED_PAUSE_S = 1.0  # without a pose
+_SPARSE = 5.0  # times the longest step of the recording: a path that chooses its poses
 
 Streams = Callable[[int], np.random.Generator]
 Planted = Callable[[Estimator, int], AbstractContextManager[object]]
@@ -244,8 +245,12 @@ def status_of_pauses(recording: Recording, stamps: Array) -> Status:
         start, end = max(start, known[0]), min(end, known[-1])
         own_s = max(own_s, float(np.diff(known).max(initial=0.0)))
     pause_s = longest_pause_s(stamps, start, end)
+    usual_s = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
     if pause_s <= max(REMARKED_PAUSE_S, own_s):
-        return Status()
+        if usual_s <= _SPARSE * own_s:
+            return Status()
+        sparse = f"a pose every {usual_s:.3g} s, where the recording allows one every {own_s:.3g} s"
+        return Status(Outcome.REMARK, GAP, sparse)
     return Status(Outcome.REMARK, GAP, f"no pose for {pause_s:.3g} s of the recording")
 
 

@@ -25,6 +25,7 @@ from experiments.runs.paths import results
 from experiments.runs.store import read_runs
 from experiments.runs.version import code_version, version_with
 from sim.errors import InputError, printable, require
+from sim.files import read_text
 
 FEW = 12  # colours, and panels
 _TIMES = ["step_time_us", "cpu_time_us"]  # they differ from run to run
@@ -32,6 +33,7 @@ _COMMAND = "estimator.command"
 COMMAND = "command.txt"  # beside the rows: the commands that made them
 UNFINISHED = "unfinished-{}.txt"  # there until its sweep has ended: how many runs, and its command
 DRAWN = ("seed", "world_seed")  # settings that only draw other samples
+_MOST_BYTES = 1 << 20  # of the commands of a folder
 _NAMED = 12  # columns that a message names
 
 
@@ -84,10 +86,8 @@ def collect(name: str, *, all_versions: bool = False, times: bool = False) -> pd
 
 def unfinished_sweeps(folder: Path) -> list[tuple[str, str]]:
     """Sweeps of a folder that have not ended: how many runs each has, and its command."""
-    texts = [
-        path.read_text(encoding="utf-8", errors="replace")
-        for path in sorted(folder.glob(UNFINISHED.format("*")))
-    ]
+    paths = sorted(folder.glob(UNFINISHED.format("*")))
+    texts = [read_text(path, _MOST_BYTES) for path in paths]
     parts = [text.partition(" ") for text in texts]
     return [(n_runs, command.rstrip()) for n_runs, _, command in parts]
 
@@ -111,7 +111,7 @@ def folder_of(name: str) -> Path:
 def commands(folder: Path) -> list[str]:
     """Commands that made the rows of a folder, as the sweeps noted them."""
     path = folder / COMMAND
-    return path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
+    return read_text(path, _MOST_BYTES).splitlines() if path.exists() else []
 
 
 def _check_distinct(table: pd.DataFrame, settings: list[str], path: Path) -> None:

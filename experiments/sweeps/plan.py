@@ -188,6 +188,13 @@ class Plan:
             If its runs have several names.
         """
         names = {f.first.name for f in self.families}
+        given = {leaf[0] for f in self.families for axis in f.axes for leaf in axis.leaves}
+        for key in ("picture", "keep"):
+            one = len({json.dumps(f.first.config[key]) for f in self.families}) == 1
+            require(
+                one and key not in given,
+                f"{key} decides no result: give it one value, not several, in a sweep",
+            )
         swept_ = any(("name",) in axis.leaves for f in self.families for axis in f.axes)
         require(
             len(names) == 1 and not swept_,
