@@ -109,7 +109,10 @@ def plot_of(rows: pd.DataFrame, name: str, panels: Panels, out: Path) -> str:
         words = [f"--x {x}", *(f"--by {each}" for each in panels.by)]
         words += [f"--col {panels.col}"] if panels.col else []
         chosen = f"drawn with {' '.join(words)}"
-    save_figure(sweep_figure(rows, **vars(panels)), out)
+    try:
+        save_figure(sweep_figure(rows, **vars(panels)), out)
+    except (ValueError, OverflowError) as error:  # of Matplotlib, for 1e308 or so
+        raise InputError(f"{out}: cannot be drawn ({error}); leave rows out by --where") from error
     return chosen
 
 

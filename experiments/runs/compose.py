@@ -139,6 +139,8 @@ class Composer:
         """
         check_overrides(overrides)
         each = [self.parse(override) for override in overrides]
+        for key in [o.key_or_group for o in each] if self._source is not None else ():
+            require(not key.startswith("hydra"), f"{self._source}: {key} cannot be set by a file")
         options, plain = ([o for o in each if self.is_plain(o) == kind] for kind in (False, True))
         base = self._base(options, [o for o in plain if o.key_or_group.endswith("_target_")])
         _check_calibrated(each)
@@ -225,7 +227,7 @@ def open_composer(
 
 def _merged(searching: Sequence[str], *, only_folders: bool) -> list[str]:
     """One override in place of several that make Hydra look for options elsewhere too."""
-    places = [str(place) for word in searching for place in parse_override(word).value()]
+    places = [place for word in searching for place in _places(parse_override(word))]
     for place in places if only_folders else ():
         require(place.startswith("file://"), f"hydra.searchpath: {place} is not a folder")
     return [f"{_SEARCHED}[{','.join(map(paths.quoted, places))}]"] if places else []
@@ -236,6 +238,12 @@ def _targets_of_conf() -> frozenset[str]:
     """Every class and function that a file of conf/ names; data may name them too."""
     texts = (path.read_text(encoding="utf-8") for path in paths.CONF.rglob("*.yaml"))
     return frozenset(name for text in texts for name in re.findall(r"_target_: *([\w.]+)", text))
+
+
+def _places(override: Override) -> list[str]:
+    """Folders in which an override makes Hydra look; none of another override."""
+    value = override.value() if override.key_or_group == "hydra.searchpath" else None
+    return list(map(str, value)) if isinstance(value, list) else []
 
 
 def _code_of_user(words: Sequence[str]) -> Iterator[str]:
@@ -250,8 +258,8 @@ def _code_of_user(words: Sequence[str]) -> Iterator[str]:
             if key in GROUPS and isinstance(value, str):
                 option = paths.CONF / key / f"{value}.yaml"
                 yield from named_code(read_yaml(option)) if option.is_file() else ()
-        for place in values[0] if key == "hydra.searchpath" else ():
-            folder = Path(str(place).removeprefix("file://"))
+        for place in _places(override):
+            folder = Path(place.removeprefix("file://"))
             for path in (path for group in GROUPS for path in (folder / group).rglob("*.yaml")):
                 yield from named_code(read_yaml(path))
 

@@ -106,14 +106,15 @@ def check_table(table: pd.DataFrame, path: Path) -> None:
     Raises
     ------
     InputError
-        If a run has no key, a key that is no file's name, an unknown status, or no number of its
-        repeat.
+        If a run has no key, a key that is no file's name, an unknown status, no estimator, or no
+        number of its repeat.
     """
     import pandas as pd
 
     sound = {
         "run_key": lambda column: column.astype(str).str.fullmatch(_KEY) & column.notna(),
         "status": lambda column: column.isin(_OUTCOMES),
+        "choice.estimator": lambda column: column.notna(),
         REPEAT: lambda column: pd.to_numeric(column, errors="coerce").mod(1) == 0,
     }
     for name in sound.keys() & {*table}:

@@ -185,5 +185,6 @@ def _plain(value: Any, default: Any) -> Any:
     """
     value = value.item() if hasattr(value, "item") else value
     if isinstance(value, str) and value.startswith("["):
-        return json.loads(value)
+        with suppress(ValueError, RecursionError):  # a text that only begins so
+            return json.loads(value)
     return int(value) if isinstance(value, (str, float)) and type(default) is int else value

@@ -134,6 +134,9 @@ STUDIES = {
     "swept feedback": "sweeps: [{route.feedback: 'truth,{_target_: hostile.Mine}'}]\n",
     "swept commands": "defaults: [{override /estimator: external}]\n"
     "sweeps: [{estimator.command: 'touch MARKER,touch MARKER2'}]\n",
+    "swept folders": "sweeps: [{hydra.searchpath: '[pkg://hostile]'}]\n",
+    "added folders": "sweeps: [{+hydra.searchpath: '[pkg://hostile]'}]\n",
+    "folders": "hydra: {searchpath: ['pkg://hostile']}\n",
     "params": "hydra: {sweeper: {params: {estimator._target_: hostile.Mine}}}\n",
 }
 
@@ -142,7 +145,7 @@ STUDIES = {
 def test_a_study_from_elsewhere_runs_nothing(marker, tmp_path, monkeypatch, name):
     path = tmp_path / "theirs.yaml"
     path.write_text("# @package _global_\n" + STUDIES[name].replace("MARKER", str(marker)))
-    with pytest.raises(InputError, match=rf"theirs\.yaml {REFUSED}"):
+    with pytest.raises(InputError, match=rf"theirs\.yaml {REFUSED}|searchpath"):
         make_plan([f"study={path}"])
     assert not marker.exists()
     if name == "estimator":
@@ -181,6 +184,8 @@ def test_a_study_of_conf_may_be_named_by_its_file():
         "estimator._target_=hostile.Mine",
         "prior.map={_target_: hostile.Mine}",
         "hydra.searchpath=[pkg://hostile]",
+        "+hydra.searchpath=[pkg://hostile]",
+        "++hydra.searchpath=[pkg://hostile]",
         "study=theirs.yaml",
     ],
 )
@@ -196,7 +201,7 @@ def test_a_suite_from_elsewhere_runs_nothing(marker, tmp_path, monkeypatch, over
             }
         )
     )
-    with pytest.raises(InputError, match=rf"{REFUSED}|is not a folder"):
+    with pytest.raises(InputError, match=rf"{REFUSED}|is not a folder|cannot be set by"):
         run_suite(read_suite(Path("suite.yaml")), {"odometry": 1}, n_jobs=1)
     assert not marker.exists()
 
