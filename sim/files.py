@@ -36,7 +36,7 @@ def read_head(path: Path) -> bytes:
         raise InputError(f"{path}: cannot read ({error.strerror})") from error
 
 
-def read_text(path: Path, most_bytes: int) -> str:
+def read_text(path: Path, most_bytes: int = 10_000_000) -> str:
     """Text of a file that may come from anywhere.
 
     Raises

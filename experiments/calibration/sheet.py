@@ -24,7 +24,6 @@ from sim.routes.route import OpenLoop
 COMMAND = ("v_mps", "omega_radps", "duration_s")
 END_POSE = ("x_m", "y_m", "heading_rad")
 COLUMNS = ("case", *COMMAND, *END_POSE)
-_MOST_BYTES = 10_000_000
 _MOST = {"v_mps": 100.0, "omega_radps": 100.0, "duration_s": 3600.0}
 
 
@@ -127,7 +126,7 @@ def unwrap_headings(headings: Sequence[Array], turns: Sequence[float]) -> list[A
 def _rows(path: Path) -> Iterator[tuple[int, dict[str, str | None]]]:
     """Number and cells of each line."""
     try:
-        with io.StringIO(read_text(path, _MOST_BYTES), newline="") as file:
+        with io.StringIO(read_text(path), newline="") as file:
             reader = csv.DictReader(file, restkey="more", skipinitialspace=True)
             given = [name.strip() for name in reader.fieldnames or ()]
             wanted, got = ",".join(COLUMNS), ",".join(given) or "none"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 from typing import Annotated
 
@@ -12,6 +13,7 @@ from experiments.cli.flags import ConfigDir
 from experiments.runs import columns, paths
 from experiments.runs.console import show
 from sim.errors import require
+from sim.files import read_text
 
 
 def options(
@@ -54,24 +56,41 @@ def options(
     if group is not None and name is not None:
         _describe(group, name, config_dir)
         return
-    for one in completion.GROUPS if group is None else (group,):
+    if group is not None:
+        names = completion.options(group, config_dir)
+        show(
+            "\n".join(f"{n:{max(map(len, names))}}  {_about(group, n, config_dir)}" for n in names)
+        )
+        return
+    for one in completion.GROUPS:
         print(f"{one:>10}: {', '.join(completion.options(one, config_dir))}")
+    print("Next: estima options GROUP says what each is, estima options NAME its keys.")
+
+
+def _file_of(group: str, name: str, config_dir: Path | None) -> Path:
+    """YAML of an option, the user's own first."""
+    files = (folder / group / f"{name}.yaml" for folder in (config_dir, paths.CONF) if folder)
+    return next(file for file in files if file.exists())
+
+
+def _about(group: str, name: str, config_dir: Path | None) -> str:
+    """What an option is: the first sentence of the comment at the head of its YAML."""
+    lines = read_text(_file_of(group, name, config_dir)).splitlines()
+    head = itertools.takewhile(lambda line: line.startswith("#"), lines)
+    words = " ".join(line.lstrip("# ") for line in head if "@package" not in line)
+    return words.partition(". ")[0].removesuffix(".")
 
 
 def _describe(group: str, name: str, config_dir: Path | None) -> None:
     """Print an option's keys; a study states its own."""
     from experiments.runs.compose import searched
     from experiments.runs.schema import describe_option
-    from sim.files import read_text
-    from sim.yaml_file import MOST_BYTES
 
     names = completion.options(group, config_dir)
     known = f"no {group} named {name}; there are: {', '.join(names)}"
     require(name in names or group in _groups_of(name, config_dir), known)
     if group == "study":
-        files = (folder / group / f"{name}.yaml" for folder in (config_dir, paths.CONF) if folder)
-        path = next(file for file in files if file.exists())
-        show(read_text(path, MOST_BYTES).rstrip())
+        show(read_text(_file_of(group, name, config_dir)).rstrip())
     else:
         show(describe_option(group, name, searched(config_dir)))
 

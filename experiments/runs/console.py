@@ -21,6 +21,9 @@ _LINE_EVERY_S = 10.0  # where the output is a file
 _RATED_S, _RATED_SHARE, _RATED_UNITS = 10.0, 0.05, 10
 
 
+TRUSTING = "if you trust where it comes from, add --trust (docs/security.md)"
+
+
 class RunFailedError(Exception):
     """A run failed; its row says how."""
 
@@ -192,13 +195,13 @@ def show(text: str) -> None:
     _write("\n".join(map(printable, text.split("\n"))), sys.stdout)
 
 
-def warn(message: str) -> None:
-    """Print one line to standard error, with what may come from a file made printable."""
-    _write(printable(" ".join(f"estima: {message}".splitlines())), sys.stderr)
+def warn(text: str) -> None:
+    """Print text to the error stream, as `show` prints to the output."""
+    _write("\n".join(map(printable, text.split("\n"))), sys.stderr)
 
 
 def _say(message: str, code: int) -> NoReturn:
-    warn(message)
+    _write(printable(" ".join(f"estima: {message}".splitlines())), sys.stderr)
     sys.exit(code)
 
 

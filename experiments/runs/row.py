@@ -84,8 +84,10 @@ def check_row(row: Row) -> None:
     for key in _TEXTS:
         require(isinstance(row.get(key), str), f"a row must have the text {key}")
     require(row["status"] in _OUTCOMES, f"a row's status is one of {', '.join(_OUTCOMES)}")
-    require(_KEY.fullmatch(str(row["run_key"])), f"row key run_key: {row['run_key']!r} is no word")
-    require(type(row.get(REPEAT, 0)) is int, f"row key repeat: {row.get(REPEAT)!r} is no number")
+    require(
+        _KEY.fullmatch(str(row["run_key"])), f"row key run_key: {row['run_key']!r} is not a word"
+    )
+    require(type(row.get(REPEAT, 0)) is int, f"row key repeat: {row.get(REPEAT)!r} is not a number")
     for key, value in row.items():
         flat = value is None or isinstance(value, (str, int, float, bool))
         require(flat, f"row key {key} must hold a scalar, got {type(value).__name__}")
