@@ -162,7 +162,8 @@ def build(cls: type[T], settings: Mapping[str, Any], where: str) -> T:
     values: dict[str, Any] = {}
     for key, value in settings.items():
         place = f"{where}.{key}"
-        require(key in fields, describe_unknown(key, fields, where))
+        if key not in fields:
+            raise InputError(describe_unknown(key, fields, where))
         values[key] = _fitted(value, kinds[key], place, check=own is None)
     for name, f in fields.items():
         bare = f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING

@@ -108,7 +108,7 @@ def check_table(table: pd.DataFrame, path: Path) -> None:
     Raises
     ------
     InputError
-        If a run has no key, a key that is no file's name, an unknown status, no estimator, or no
+        If a run lacks a key that can name a file, a known status, an estimator, or a whole
         number of its repeat.
     """
     import pandas as pd
