@@ -12,7 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import ThreadpoolController
 
-from estimators.base import Answer, Estimate, Estimator, Prior, run, run_and_finish
+from estimators.base import (
+    Answer,
+    Estimate,
+    Estimator,
+    Prior,
+    explain_unsound,
+    run,
+    run_and_finish,
+)
 from estimators.team import run_team
 from experiments.evaluation.map_quality import landmark_errors
 from experiments.evaluation.metrics import (
@@ -223,11 +231,14 @@ def status_of(recording: Recording, online: Estimate, revised: Estimate | None =
     if online.status == "ok" and not sound.any():
         return Status(Outcome.FAILED, "not_finite", "no pose at any time: it was never placed")
     if online.status == "ok" and not sound.all():
-        when = online.stamps[np.argmin(sound)]
-        return Status(Outcome.FAILED, "not_finite", f"not finite at {when:.2f} s")
-    pauses = [
-        status_of_pauses(recording, path.stamps) for path in (online, revised) if path is not None
-    ]
+        step = int(np.argmin(sound))
+        detail = f"not finite at {online.stamps[step]:.2f} s, step {step}"
+        return Status(Outcome.FAILED, "not_finite", detail)
+    paths = [path for path in (online, revised) if path is not None]
+    for path in paths:
+        if why := explain_unsound(path):
+            return Status(Outcome.FAILED, "unsound", f"{path.kind}: {why}")
+    pauses = [status_of_pauses(recording, path.stamps) for path in paths]
     worst = max(pauses, key=lambda status: status.code)
     if online.status == "ok":
         return worst
