@@ -37,7 +37,7 @@ from typing import (
 from pydantic import ConfigDict, Field, Strict, ValidationError
 from pydantic.dataclasses import dataclass as checked_dataclass
 
-from sim.errors import InputError, describe_unknown, require
+from sim.errors import InputError, blaming, describe_unknown, require
 
 T = TypeVar("T")
 
@@ -195,12 +195,13 @@ def find(target: Any, where: str) -> Callable[..., Any]:
         f"{where}._target_ must name a class or function, such as mine.Mine",
     )
     module_name, _, name = target.rpartition(".")
-    try:
-        module = importlib.import_module(module_name)
-    except ModuleNotFoundError as error:
-        raise InputError(
-            f"{where}._target_={target}: no module {error.name}; is its folder on PYTHONPATH?"
-        ) from error
+    with blaming(f"{where}._target_={target}"):  # what its module does when it is imported
+        try:
+            module = importlib.import_module(module_name)
+        except ModuleNotFoundError as error:
+            raise InputError(
+                f"{where}._target_={target}: no module {error.name}; is its folder on PYTHONPATH?"
+            ) from error
     found: Any = getattr(module, name, None)
     require(callable(found), f"{where}._target_={target}: {module_name} has no class {name}")
     return found  # type: ignore[no-any-return]
