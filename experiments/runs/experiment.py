@@ -16,7 +16,7 @@ from omegaconf import OmegaConf
 from estimators.base import Estimator
 from estimators.programs.host import Isolated
 from experiments.runs import paths
-from experiments.runs.compose import name_study_files, open_composer
+from experiments.runs.compose import open_composer
 from experiments.runs.key import origin_columns, run_key
 from experiments.runs.objects import OF_TEAMS, Objects, is_grid_file
 from experiments.runs.row import Row
@@ -43,10 +43,18 @@ class Experiment(Objects):
     """A world, a robot, its sensors and route, or a recording of them; and an estimator."""
 
     @classmethod
-    def compose(cls, overrides: Sequence[str] = ()) -> Experiment:
-        """Compose an experiment from Hydra's overrides, such as `world=office seed=3`."""
-        with open_composer() as composer:
-            return cls(*composer.compose(name_study_files(overrides)).resolve())
+    def compose(
+        cls, overrides: Sequence[str] = (), data: Sequence[str] = (), source: object = ""
+    ) -> Experiment:
+        """Compose an experiment from Hydra's overrides, such as `world=office seed=3`.
+
+        Parameters
+        ----------
+        data, source
+            Further overrides that the user did not write, and the file that they come from.
+        """
+        with open_composer(overrides, data, source) as composer:
+            return cls(*composer.compose(composer.words).resolve())
 
     def with_values(self, **values: Any) -> Experiment:
         """Return the experiment with other values of top-level keys, such as `seed=3`."""

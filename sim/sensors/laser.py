@@ -98,7 +98,7 @@ def check_range(sensor: Any) -> None:
     """Check that a sensor's ranges begin before they end, or it would see nothing."""
     require(
         sensor.min_range_m < sensor.max_range_m,
-        f"{sensor._place}.min_range_m must be below max_range_m, or nothing is seen; got "
+        f"{sensor._options_place}.min_range_m must be below max_range_m, or nothing is seen; got "
         f"{sensor.min_range_m:g} and {sensor.max_range_m:g}",
     )
 
