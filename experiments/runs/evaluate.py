@@ -29,6 +29,7 @@ from experiments.evaluation.metrics import (
     longest_pause_s,
     score,
 )
+from experiments.runs.bounds import bound_columns
 from experiments.runs.columns import OF_THE_RUN, REVISED, Average, average_of
 from experiments.runs.experiment import Experiment
 from experiments.runs.objects import Objects
@@ -115,6 +116,8 @@ def evaluate(
             status, scores = statuses[0], every[0]
             if experiment.team is not None:
                 status, scores = status_of_team(statuses), scores_of_team(read, every)
+            else:
+                scores = scores | _bounds(experiment, *paired[0])
         except InputError:
             raise
         except BaseException as error:
@@ -127,6 +130,15 @@ def evaluate(
                 on_estimate(recording, repeat, online, revised)
         rows.append({**labels, "repeat": repeat, **status.columns(), **scores})
     return rows
+
+
+def _bounds(
+    experiment: Experiment, recording: Recording, _: Estimate, revised: Estimate | None
+) -> Row:
+    """Columns of what no method can beat."""
+    prior, after_s = experiment.prior(recording), experiment.config["scoring"]["after_s"]
+    with limit_blas():
+        return {**bound_columns(experiment, recording, prior, revised is not None, after_s)}
 
 
 def runner(
