@@ -20,7 +20,7 @@ import scipy.linalg
 
 from sim.arrays import Array, Ints
 
-_GROUPS = 100  # times at most that S is factorised for the online bound
+_GROUPS = 50  # times at most that S is factorised for the online bound
 _RANK = 1e-13  # share of the greatest eigenvalue below which a covariance is singular
 
 
@@ -79,8 +79,8 @@ class PathBound(NamedTuple):
 def bound_path(chain: Chain) -> PathBound:
     """Bounds on the poses of a path.
 
-    With more than 100 Frames that see unknown landmarks, the online bound knows the landmarks as
-    they are known up to a hundredth of the path later: it is a little lower, so still a bound.
+    With more than 50 Frames that see unknown landmarks, the online bound knows the landmarks as
+    they are known up to a fiftieth of the path later: it is a little lower, so still a bound.
     """
     predicted, online = _filter(chain)
     gains = np.zeros_like(online)
@@ -127,52 +127,49 @@ def _with_landmarks(chain: Chain, sights: Sights, given: PathBound, gains: Array
             U[k] -= given.online[k] @ V[k]
     online, revised = given.online.copy(), given.revised.copy()
     S, begin = np.zeros((n, n)), int(seeing[0])
-    for last in _group_ends(seeing):
-        group = slice(begin, last + 1)
-        _add_information(S, chain, sights, given.online, U, V, cross, group)
-        begin = last + 1
-        known = 3 * (int(sights.landmarks[: np.searchsorted(sights.rows, begin)].max()) + 1)
-        until = begin if last < seeing[-1] else n_frames
-        span = slice(group.start, until)
-        online[span] += _spread(S[:known, :known], U[span, :, :known])
+    for end in _group_ends(seeing, n_frames):
+        group = slice(begin, end)
+        seen = slice(*np.searchsorted(sights.rows, [begin, end]))
+        known = 3 * (int(sights.landmarks[: seen.stop].max()) + 1)
+        part = S[:known, :known]
+        _add_information(
+            part,
+            chain.information[group],
+            given.online[group],
+            U[group, :, :known],
+            V[group, :, :known],
+        )
+        for landmark, own in zip(sights.landmarks[seen], sights.own[seen], strict=True):
+            part[3 * landmark : 3 * landmark + 3, 3 * landmark : 3 * landmark + 3] += own
+        online[group] += _spread(part, U[group, :, :known])
+        begin = end
     for k in range(n_frames - 2, -1, -1):
         U[k] += gains[k] @ (U[k + 1] - chain.by_before[k + 1] @ U[k])
     return PathBound(online, revised + _spread(S, U))
 
 
-def _group_ends(seeing: Ints) -> list[int]:
-    """Frames after which the information about landmarks is read: each, or a hundred of them."""
+def _group_ends(seeing: Ints, n_frames: int) -> list[int]:
+    """Frames up to which, each excluded, the information about landmarks is read."""
     parts = np.array_split(seeing, min(len(seeing), _GROUPS))
-    following = [int(part[0]) - 1 for part in parts[1:]]
-    return [*following, int(seeing[-1])]
+    return [*(int(part[0]) for part in parts[1:]), n_frames]
 
 
-def _add_information(
-    S: Array,
-    chain: Chain,
-    sights: Sights,
-    updated: Array,
-    U: Array,
-    V: Array,
-    cross: Array,
-    group: slice,
-) -> None:
-    """Add to S (n, n) what the Frames of a group tell of the landmarks."""
+def _add_information(S: Array, information: Array, updated: Array, U: Array, V: Array) -> None:
+    """Add to S (n, n) what Frames tell of the landmarks, but for their own information."""
     # With the residual's derivative B + A U~ by the landmarks, U~ before the update, it is
     # (B + A U~)^T (R + A P~ A^T)^-1 (B + A U~); V is A^T R^-1 (B + A U~), so U~ = U + P V.
-    before = U[group] + updated[group] @ V[group]
-    outer = 2.0 * V[group] - chain.information[group] @ before
-    n = S.shape[0]
+    n, gain = len(S), updated @ V
+    before = U + gain
+    outer = 2.0 * V - information @ before
     whole = before.reshape(-1, n).T @ outer.reshape(-1, n)
-    whole -= V[group].reshape(-1, n).T @ (updated[group] @ V[group]).reshape(-1, n)
+    whole -= V.reshape(-1, n).T @ gain.reshape(-1, n)
     S += (whole + whole.T) / 2.0
-    for k in range(*np.searchsorted(sights.rows, [group.start, group.stop])):
-        block = slice(3 * sights.landmarks[k], 3 * sights.landmarks[k] + 3)
-        S[block, block] += sights.own[k]
 
 
 def _spread(S: Array, U: Array) -> Array:
     """U S^-1 U^T (T, 3, 3) of U (T, 3, n)."""
-    flat = U.reshape(-1, U.shape[-1])
-    solved = scipy.linalg.cho_solve(scipy.linalg.cho_factor(S), flat.T, overwrite_b=False)
-    return np.asarray(np.einsum("tin,ntj->tij", U, solved.reshape(-1, len(U), 3)))
+    root = scipy.linalg.cholesky(S, lower=True, check_finite=False)
+    flat = np.ascontiguousarray(U.reshape(-1, len(S))).T
+    half = scipy.linalg.solve_triangular(root, flat, lower=True, check_finite=False)
+    rows = half.T.reshape(U.shape)
+    return np.asarray(rows @ rows.transpose(0, 2, 1))

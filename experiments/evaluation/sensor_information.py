@@ -82,22 +82,24 @@ def laser_information(world: World, laser: Laser, poses: Array, ranges_m: ArrayL
     """
     from sim.sensors.casting import SegmentCaster  # needs a compiler
 
-    caster, informations = SegmentCaster(world, laser), np.zeros((len(poses), 3, 3))
-    measured = np.asarray(ranges_m)
+    caster, measured = SegmentCaster(world, laser), np.asarray(ranges_m)
+    in_sensor = np.zeros((len(poses), 3, 3))  # in axes of the sensor, where beams do not turn
+    cos, sin = np.cos(laser.bearings_rad), np.sin(laser.bearings_rad)
+    sensors = se2.compose(poses, laser.mount.pose)
     for begin in range(0, len(poses), _CHUNK):
         part = slice(begin, begin + _CHUNK)
-        at = se2.compose(poses[part], laser.mount.pose)
-        ranges, slopes = _cast_slopes(caster, at)
+        r, q = _cast_slopes(caster, sensors[part])
         with np.errstate(invalid="ignore"):
-            usable = np.isfinite(ranges) & (np.abs(slopes) < _STEEPEST)
-            usable &= np.abs(measured[part] - ranges) < _OUTLIER * laser.sigma_range_m
-        r, q = np.where(usable, ranges, 0.0), np.where(usable, slopes, 0.0)
-        angle = at[:, 2:] + laser.bearings_rad
-        cos, sin = np.cos(angle), np.sin(angle)
-        by_sensor = np.stack([-cos - q * sin, -sin + q * cos, q * r], axis=1) * usable[:, None]
-        informations[part] = by_sensor @ by_sensor.transpose(0, 2, 1)
+            usable = np.abs(measured[part] - r) < _OUTLIER * laser.sigma_range_m
+            usable &= np.abs(q) < _STEEPEST
+        r, q = np.where(usable, r, 0.0), np.where(usable, q, 0.0)
+        slopes = np.stack([-(usable * cos) - q * sin, q * cos - usable * sin, q * r], axis=1)
+        in_sensor[part] = slopes @ slopes.transpose(0, 2, 1)
+    # by the pose: the sensor's, turned into its axes
     by_base, _ = se2.compose_jacobians(poses, laser.mount.pose)
-    return np.asarray(by_base.transpose(0, 2, 1) @ informations @ by_base / laser.sigma_range_m**2)
+    _, turned = se2.compose_jacobians(sensors, np.zeros(3))
+    by_pose = turned.transpose(0, 2, 1) @ by_base
+    return np.asarray(by_pose.transpose(0, 2, 1) @ in_sensor @ by_pose / laser.sigma_range_m**2)
 
 
 def _cast_slopes(caster: Any, at: Array) -> tuple[Array, Array]:

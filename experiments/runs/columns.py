@@ -68,7 +68,9 @@ _OF_THE_PATH = {
     "ate_aligned_rmse_m": Column("position RMSE after alignment", "ATE aligned", "m"),
     "heading_rmse_rad": Column("heading RMSE", "heading", "rad"),
     "bound_rmse_m": Column("least position RMSE of any method", "bound", "m", better=None),
-    "bound_heading_rad": Column("least heading RMSE of any method", "heading bound", "rad", better=None),
+    "bound_heading_rad": Column(
+        "least heading RMSE of any method", "heading bound", "rad", better=None
+    ),
     "heading_aligned_rmse_rad": Column("heading RMSE after alignment", "heading aligned", "rad"),
     "final_position_error_m": Column("final position error", "final ATE", "m"),
     "final_heading_error_rad": Column("final heading error", "final heading", "rad"),
