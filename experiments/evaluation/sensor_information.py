@@ -92,8 +92,8 @@ def laser_information(world: World, laser: Laser, poses: Array, ranges_m: ArrayL
         with np.errstate(invalid="ignore"):
             usable = np.abs(measured[part] - r) < _OUTLIER * laser.sigma_range_m
             usable &= np.abs(q) < _STEEPEST
-        r, q = np.where(usable, r, 0.0), np.where(usable, q, 0.0)
-        slopes = np.stack([-(usable * cos) - q * sin, q * cos - usable * sin, q * r], axis=1)
+        hits, r, q = 1.0 * usable, np.where(usable, r, 0.0), np.where(usable, q, 0.0)
+        slopes = np.stack([-hits * cos - q * sin, q * cos - hits * sin, q * r], axis=1)
         in_sensor[part] = slopes @ slopes.transpose(0, 2, 1)
     # by the pose: the sensor's, turned into its axes
     by_base, _ = se2.compose_jacobians(poses, laser.mount.pose)
