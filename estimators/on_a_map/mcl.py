@@ -46,8 +46,8 @@ from sim.worlds.world import World
 
 Recovery = Literal["none", "average", "rivals"]
 
-_OFF_WALLS = 2.0  # what a beam of a contest loses, in log likelihood, by ending off the walls
 _BISECTIONS = 12
+_SAMPLED = 16  # one in so many poses tried on the floor decides by how much a scan counts there
 _MOST_PARTICLES, _MOST_TRIES = 10_000_000, 100_000_000  # 0.2 and 2 GB of poses
 _FARTHEST_M, _FARTHEST_RAD = 1.0, 0.5  # of what belongs to one hypothesis
 _MOST_BINS = 250_000_000  # 2 GB
@@ -119,7 +119,7 @@ class MclOptions(WheelOptions, FieldOptions, BinOptions, LaserOptions):
     """Greatest number of particles, with which it starts."""
     n_beams: Count = 60
     """Beams of each scan that are used, evenly spaced."""
-    beam_power: Positive = 0.1
+    beam_power: Positive = 0.3
     """Each beam's likelihood is raised to this power, since neighbouring beams err together and
     particles are few for so sharp a likelihood; 1 for independent beams."""
     min_ess: NonNegative = 0.4
@@ -139,7 +139,7 @@ class MclOptions(WheelOptions, FieldOptions, BinOptions, LaserOptions):
     """Spread added to the place of each particle drawn, so that copies differ, m."""
     jitter_rad: NonNegative = 0.005
     """Spread added to the heading of each particle drawn, rad."""
-    recovery: Recovery = "average"
+    recovery: Recovery = "rivals"
     """Recovery from being lost: by the `average` of the fit over time, by `rivals` that see the
     same scans, or `none`."""
     alpha_slow: NonNegative = 0.01
@@ -211,17 +211,6 @@ class Mcl(MclOptions):
         )
         self._wheels = WheelPrediction(self, prior.robot.track_m)
         self._field = likelihood_field(prior.map, self._laser, self)
-        if self.recovery == "rivals":
-            # off the walls every end is as unlikely: else beams that end short, at people, outweigh
-            # all others, and beams that end in the unknown are better than those
-            off_walls = math.exp(-_OFF_WALLS) * self._laser.max_range_m
-            blunt = FieldOptions(
-                cell_m=self.cell_m,
-                sigma_m=self.sigma_m,
-                z_hit=1.0,
-                z_rand=off_walls / (self.sigma_m * math.sqrt(2.0 * math.pi)),
-            )
-            self._bounded = likelihood_field(prior.map, self._laser, blunt)
         self._bins = Bins(self._field, self)
         self._off_map = prior.mean is not None and not self._field.holds(prior.mean)
         start, self._everywhere = prior.start, prior.start is None
@@ -279,7 +268,7 @@ class Mcl(MclOptions):
     def _weigh(self, ends: Floats) -> None:
         """Weight by one scan, sum up the belief, and resample if that is due."""
         if self._everywhere:
-            self._poses = self._drawn_by_scan(self.max_particles, ends, self._field)
+            self._poses = self._drawn_by_scan(self.max_particles, ends)
             self._everywhere = False
             self._belief = self._summed_up()
             return
@@ -293,20 +282,25 @@ class Mcl(MclOptions):
             self._draw(share, ends)
 
     def _weighed(self, of_scan: Array) -> Array:
-        """Log weights (M,) with a scan counted by `beam_power`, or by as much as `min_ess` lets.
+        """Log weights (M,) with a scan of log likelihoods (M,), counted as far as they bear it."""
+        least = min(self.min_ess * len(of_scan), effective_sample_size(self._log_weights))
+        power = self._power(self._log_weights, of_scan, least)
+        weights = self._log_weights + power * of_scan
+        return np.zeros(len(weights)) if have_underflowed(weights) else weights - np.max(weights)
+
+    def _power(self, log_weights: Array, of_scan: Array, least: float) -> float:
+        """Power of a scan's likelihood: `beam_power`, or what leaves an effective size of `least`.
 
         The effective sample size falls as the power grows, so the power is found by bisection.
         """
-        least = min(self.min_ess * len(of_scan), effective_sample_size(self._log_weights))
         low, high = 0.0, self.beam_power
-        weights = self._log_weights + high * of_scan
-        if effective_sample_size(weights) < least:
-            for _ in range(_BISECTIONS):
-                middle = (low + high) / 2.0
-                poor = effective_sample_size(self._log_weights + middle * of_scan) < least
-                low, high = (low, middle) if poor else (middle, high)
-            weights = self._log_weights + low * of_scan
-        return np.zeros(len(weights)) if have_underflowed(weights) else weights - np.max(weights)
+        if effective_sample_size(log_weights + high * of_scan) >= least:
+            return high
+        for _ in range(_BISECTIONS):
+            middle = (low + high) / 2.0
+            poor = effective_sample_size(log_weights + middle * of_scan) < least
+            low, high = (low, middle) if poor else (middle, high)
+        return low
 
     def _injected_share(self, of_scan: Array, n_beams: int) -> float:
         """Share of particles to inject: the short average of the fit against the long one.
@@ -331,13 +325,14 @@ class Mcl(MclOptions):
         n = self.n_rivals
         if self._contest is None:
             defenders = self._poses[resample(self._log_weights, n, self._rng, self.resampling)]
-            rivals = self._drawn_by_scan(n, ends, self._bounded)
+            rivals = self._drawn_by_scan(n, ends)
             self._contest = np.stack([self._jittered(defenders), rivals])
             self._explained, self._n_explained, self._n_contested = np.zeros((2, n)), 0, 0
             return False
         for side in (0, 1):
-            of_scan = self._bounded.log_likelihood(self._contest[side], ends)
-            drawn = resample(self.beam_power * of_scan, n, self._rng, self.resampling)
+            of_scan = self._field.log_likelihood(self._contest[side], ends)
+            power = self._power(np.zeros(n), of_scan, self.min_ess * n)
+            drawn = resample(power * of_scan, n, self._rng, self.resampling)
             self._explained[side] = (self._explained[side] + of_scan)[drawn]
             self._contest[side] = self._jittered(self._contest[side][drawn])
         self._n_explained += ends.shape[1]
@@ -359,11 +354,14 @@ class Mcl(MclOptions):
         moved: Array = poses + jitter * [self.jitter_m, self.jitter_m, self.jitter_rad]
         return moved
 
-    def _drawn_by_scan(self, n: int, ends: Floats, field: LikelihoodField) -> Array:
+    def _drawn_by_scan(self, n: int, ends: Floats) -> Array:
         """Poses (n, 3) over all the floor, drawn by how well the scan fits there."""
-        tries = field.draw(n * self.tries, self._rng)
-        log_weights = self.beam_power * field.log_likelihood(tries, ends)
-        return tries[resample(log_weights, n, self._rng, self.resampling)]
+        tries = self._field.draw(n * self.tries, self._rng)
+        of_scan = self._field.log_likelihood(tries, ends)
+        sample = of_scan[:: min(self.tries, _SAMPLED)]
+        least = self.min_ess * n * len(sample) / len(tries)
+        power = self._power(np.zeros(len(sample)), sample, least)
+        return tries[resample(power * of_scan, n, self._rng, self.resampling)]
 
     def _draw(self, injected_share: float, ends: Floats) -> None:
         """Resample to as many particles as the bins they fall into call for, and inject others."""
@@ -375,7 +373,7 @@ class Mcl(MclOptions):
             drawn = resample(self._log_weights, n - n_injected, self._rng, self.resampling)
             poses = self._poses[drawn]
             if n_injected > 0:
-                poses = np.concatenate([poses, self._drawn_by_scan(n_injected, ends, self._field)])
+                poses = np.concatenate([poses, self._drawn_by_scan(n_injected, ends)])
             needed = min(
                 max(self._bins.count_particles(poses), self.min_particles), self.max_particles
             )
