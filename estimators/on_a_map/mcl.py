@@ -101,7 +101,7 @@ class Bins:
 
     def count_particles(self, poses: Array) -> int:
         """Particles that the number of bins in use by poses (M, 3) calls for."""
-        k = np.count_nonzero(np.bincount(self.number(poses)))
+        k = len(np.unique(self.number(poses)))
         if k < 2:
             return 1
         a = 2.0 / (9.0 * (k - 1))
@@ -122,6 +122,10 @@ class MclOptions(WheelOptions, FieldOptions, BinOptions, LaserOptions):
     beam_power: Positive = 0.3
     """Each beam's likelihood is raised to this power, since neighbouring beams err together and
     particles are few for so sharp a likelihood; 1 for independent beams."""
+    search_sigma_m: Positive = 0.2
+    """The same while the belief calls for more than `min_particles`, and of poses drawn over the
+    floor: a sharp likelihood would pass between the particles (Pfaff, Burgard, Fox 2006, Robust
+    Monte-Carlo localization using adaptive likelihood models)."""
     min_ess: NonNegative = 0.4
     """A scan counts for less when it would leave less than this share of the particles; below
     `ess_share`."""
@@ -211,6 +215,8 @@ class Mcl(MclOptions):
         )
         self._wheels = WheelPrediction(self, prior.robot.track_m)
         self._field = likelihood_field(prior.map, self._laser, self)
+        wide = FieldOptions(sigma_m=self.search_sigma_m, max_loss=self.max_loss, cell_m=self.cell_m)
+        self._search_field = likelihood_field(prior.map, self._laser, wide)
         self._bins = Bins(self._field, self)
         self._off_map = prior.mean is not None and not self._field.holds(prior.mean)
         start, self._everywhere = prior.start, prior.start is None
@@ -272,7 +278,9 @@ class Mcl(MclOptions):
             self._everywhere = False
             self._belief = self._summed_up()
             return
-        of_scan = self._field.log_likelihood(self._poses, ends)
+        narrow = self._bins.count_particles(self._poses) <= self.min_particles
+        field = self._field if narrow else self._search_field
+        of_scan = field.log_likelihood(self._poses, ends)
         self._log_weights = self._weighed(of_scan)
         self._belief = self._summed_up()
         if self.recovery == "rivals" and self._yielded(ends):
@@ -330,7 +338,7 @@ class Mcl(MclOptions):
             self._explained, self._n_explained, self._n_contested = np.zeros((2, n)), 0, 0
             return False
         for side in (0, 1):
-            of_scan = self._field.log_likelihood(self._contest[side], ends)
+            of_scan = self._search_field.log_likelihood(self._contest[side], ends)
             power = self._power(np.zeros(n), of_scan, self.min_ess * n)
             drawn = resample(power * of_scan, n, self._rng, self.resampling)
             self._explained[side] = (self._explained[side] + of_scan)[drawn]
@@ -357,7 +365,7 @@ class Mcl(MclOptions):
     def _drawn_by_scan(self, n: int, ends: Floats) -> Array:
         """Poses (n, 3) over all the floor, drawn by how well the scan fits there."""
         tries = self._field.draw(n * self.tries, self._rng)
-        of_scan = self._field.log_likelihood(tries, ends)
+        of_scan = self._search_field.log_likelihood(tries, ends)
         sample = of_scan[:: min(self.tries, _SAMPLED)]
         least = self.min_ess * n * len(sample) / len(tries)
         power = self._power(np.zeros(len(sample)), sample, least)

@@ -339,25 +339,23 @@ def test_the_field_is_that_of_the_walls_to_half_a_cell():
 
 
 @pytest.mark.parametrize("yaw", [0.0, 0.7])
-def test_unknown_is_no_floor_and_likelier_than_free_but_not_than_walls(yaw):
+def test_unknown_is_no_floor_and_as_likely_as_free(yaw):
     """A wall along x, free below it, unknown above; the grid may lie askew."""
     values = np.zeros((80, 120), np.float32)
     values[40], values[41:] = 1.0, np.nan
     grid = OccupancyGrid(values, 0.05, np.array([2.0, 1.0, yaw]))
-    z_hit, z_rand, sigma_m = 0.9, 0.1, 0.1
-    field = likelihood_field(grid, LASER, FieldOptions(cell_m=0.02, sigma_m=sigma_m))
-    peak = z_hit / (sigma_m * math.sqrt(2 * math.pi)) + z_rand / 30.0
+    field = likelihood_field(grid, LASER, FieldOptions(cell_m=0.02, sigma_m=0.1, max_loss=3.0))
 
     def likelihood(y_cells):
         end = se2.transform(grid.origin, [[3.0, 0.05 * y_cells]]).T.astype(np.float32)
         at = field.log_likelihood(np.zeros((1, 3)), np.ascontiguousarray(end))[0]
-        return peak * math.exp(at)
+        return (1.0 + math.exp(-3.0)) * math.exp(at)
 
-    assert likelihood(40.5) == pytest.approx(peak, rel=0.05)
-    assert likelihood(10.5) == pytest.approx(z_rand / 30.0, rel=0.01)
-    assert likelihood(70.5) == pytest.approx(1.0 / 30.0, rel=0.01)
-    assert likelihood(400.5) == pytest.approx(1.0 / 30.0, rel=0.01)  # off the grid
-    assert likelihood(42.5) > 10.0 / 30.0  # just behind the wall: it may be hit there
+    assert likelihood(40.5) == pytest.approx(1.0 + math.exp(-3.0), rel=0.05)
+    for cells in (10.5, 70.5, 400.5):  # free, unknown, off the grid
+        assert likelihood(cells) == pytest.approx(math.exp(-3.0), rel=0.01)
+    for cells in (1.5, 3.5, 5.5):  # as much before the wall as behind it
+        assert likelihood(40.5 + cells) == pytest.approx(likelihood(40.5 - cells), rel=0.3)
     drawn = field.draw(2000, np.random.default_rng(0))
     places = se2.transform(se2.inverse(grid.origin), drawn[:, :2]) / 0.05
     assert np.all((places >= -0.5) & (places[:, :2] <= [120.5, 40.5]))
