@@ -37,7 +37,7 @@ from typing import (
 from pydantic import ConfigDict, Field, Strict, ValidationError
 from pydantic.dataclasses import dataclass as checked_dataclass
 
-from sim.errors import InputError, require
+from sim.errors import InputError, describe_unknown, require
 
 T = TypeVar("T")
 
@@ -151,7 +151,7 @@ def build(cls: type[T], settings: Mapping[str, Any], where: str) -> T:
     values: dict[str, Any] = {}
     for key, value in settings.items():
         place = f"{where}.{key}"
-        require(key in fields, f"unknown key {place}; known: {', '.join(fields)}")
+        require(key in fields, describe_unknown(key, fields, where))
         values[key] = _fitted(value, kinds[key], place, check=own is None)
     for name, f in fields.items():
         bare = f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING
@@ -278,7 +278,7 @@ def _complaint(cls: type, where: str, error: ValidationError) -> str:
     place = f"{where}.{name}" if where else name
     known = {option.name: option for option in described(cls)}
     if name not in known:
-        return f"unknown key {place}; known: {', '.join(known)}"
+        return describe_unknown(name, known, where)
     if first["type"] == "missing" and len(first["loc"]) == 1:
         return f"{place} is missing"
     wanted = known[name].accepts or first["msg"].removeprefix("Input should be ")
