@@ -29,6 +29,7 @@ from experiments.runs.targets import make
 from sim.arrays import Array
 from sim.errors import InputError, blaming, require, required
 from sim.options import build
+from sim.people.walk import People
 from sim.recording import Frame, Recording
 from sim.robot.base import RobotGeometry, robot_from_config
 from sim.sensors import Sensor, Sensors, sensors_from_config
@@ -158,7 +159,11 @@ class Objects:
         simulation = dataclasses.asdict(
             build(SimulationOptions, self.config["simulation"], "simulation")
         )
-        return record_team(self.world(), members, **simulation, on_progress=on_progress)
+        people = build(People, self.config["people"], "people")
+        passers_by = people, stream(self.seed, "people")
+        return record_team(
+            self.world(), members, **simulation, passers_by=passers_by, on_progress=on_progress
+        )
 
     def simulate(
         self,

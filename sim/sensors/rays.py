@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from sim.arrays import Array, Bools
+from sim.people.walk import Crowd
 from sim.robot.base import Robot
 from sim.se2 import transform
 from sim.sensors.base import Rays
@@ -80,6 +81,76 @@ def _faces(robot: Robot, pose: Array) -> Array:
     x, y = robot.body_length_m / 2, robot.body_width_m / 2
     corners = transform(pose, np.array([[x, y], [-x, y], [-x, -y], [x, -y]]))
     return np.hstack([corners, np.roll(corners, -1, axis=0)])
+
+
+class AmongPeople:
+    """Rays in a world in which people walk: legs below, a torso above, upright and round.
+
+    Parameters
+    ----------
+    rays
+        Those of the world, and of the robots in it.
+    """
+
+    def __init__(self, rays: Rays, crowd: Crowd) -> None:
+        self._rays, self._crowd = rays, crowd
+
+    def scan(self, scanner: Any, pose: Array) -> Array:
+        """Ranges (beams,) m of a scanner on the robot at a pose (3,); inf without a return."""
+        eye = scanner.mount.in_map(pose)
+        discs = self._crowd.discs(np.array(self._crowd.now_s), scanner.mount.z_m)
+        to_people = ranges_to_discs(eye[:2], eye[2] + scanner.bearings_rad, discs)
+        to_people[to_people > scanner.max_range_m] = np.inf
+        return np.minimum(self._rays.scan(scanner, pose), to_people)
+
+    def cloud(self, lidar: Any, pose: Array) -> Array:
+        """Ranges (rings, azimuths) m of a lidar on the robot at a pose (3,)."""
+        eye, elevations = lidar.mount.in_map(pose), lidar.elevations_rad[:, None]
+        found = self._rays.cloud(lidar, pose)
+        for discs, bottom_m, top_m in self._cylinders():
+            away = ranges_to_discs(eye[:2], eye[2] + lidar.azimuths_rad, discs)
+            height = lidar.mount.z_m + np.where(np.isfinite(away), away, 0.0) * np.tan(elevations)
+            hit = (bottom_m <= height) & (height <= top_m)
+            slant = away / np.cos(elevations)
+            found = np.minimum(found, np.where(hit & (slant <= lidar.max_range_m), slant, np.inf))
+        return found
+
+    def sees(self, origin: Array, points: Array) -> Bools:
+        """Whether nothing stands between a point (3,) and each of others (K, 3)."""
+        seen = self._rays.sees(origin, points)
+        offsets = points - origin
+        level_m = np.maximum(np.hypot(*offsets[:, :2].T), 1e-9)
+        angles = np.arctan2(offsets[:, 1], offsets[:, 0])
+        for discs, bottom_m, top_m in self._cylinders():
+            away = ranges_to_discs(origin[:2], angles, discs)
+            share = np.where(np.isfinite(away), away / level_m, 2.0)
+            height = origin[2] + share * offsets[:, 2]
+            seen &= ~((share < 1.0) & (bottom_m <= height) & (height <= top_m))
+        return seen
+
+    def _cylinders(self) -> list[tuple[Array, float, float]]:
+        """Circles (K, 3) of the legs and of the torsos, and their heights from and to, m."""
+        people, now = self._crowd.people, np.array(self._crowd.now_s)
+        split_m = people.legs_top_m
+        legs, torsos = self._crowd.discs(now, split_m), self._crowd.discs(now, people.height_m)
+        return [(legs, 0.0, split_m), (torsos, split_m, people.height_m)]
+
+
+def ranges_to_discs(origin: Array, angles_rad: Array, discs: Array) -> Array:
+    """Ranges (B,) m from a point (2,) at angles (B,) to the nearest of upright cylinders (K, 3).
+
+    Or from points (B, 2), to discs (B, K, 3), each beam to its own. inf where there is none; of a
+    point within one, 0.
+    """
+    offset = discs[..., :2] - origin[..., None, :]  # (K, 2) or (B, K, 2)
+    x, y = offset[..., 0], offset[..., 1]
+    cos, sin = np.cos(angles_rad)[:, None], np.sin(angles_rad)[:, None]
+    along, across = cos * x + sin * y, cos * y - sin * x
+    depth2 = discs[..., 2] ** 2 - across**2
+    with np.errstate(invalid="ignore"):
+        half = np.sqrt(depth2)
+    hit = (depth2 >= 0.0) & (along + half >= 0.0)
+    return np.where(hit, np.maximum(along - half, 0.0), np.inf).min(axis=1, initial=np.inf)
 
 
 class BulletRays:
