@@ -11,9 +11,10 @@ import numpy as np
 from sim.arrays import Array
 from sim.people.walk import Crowd
 from sim.robot.base import TICK_S, Robot
+from sim.routes.feedback import CONTROL_TICKS
 from sim.sensors.base import Reading
 
-_KEPT_OFF_M = 0.05  # from people, at rest
+_KEPT_OFF_M, _BESIDE_M = 0.25, 0.03  # from people ahead, who need room to step aside; beside
 _BRAKING_SHARE = 0.4  # of the wheels' acceleration
 _LONGEST_WAIT_S = 120.0
 
@@ -38,7 +39,8 @@ class GivingWay:
     ) -> None:
         self._driver, self._crowd, self._number, self._pose = driver, crowd, number, true_pose
         self._brake_mps2 = _BRAKING_SHARE * robot.max_acceleration_mps2
-        self._clock, self._tick, self._pace, self._waited_s = 0.0, -1, 1.0, 0.0
+        self._clock, self._tick, self._waited_s = 0.0, -1, 0.0
+        self._pace, self._share = 1.0, 1.0  # of the commands' speed: now, and allowed
         self._wanted: Array | None = np.zeros(2)
 
     def command(self, tick: int, pose: Array) -> Array | None:
@@ -50,8 +52,9 @@ class GivingWay:
             return None
         v_mps = float(self._wanted[0])
         change = self._brake_mps2 * TICK_S / max(abs(v_mps), 0.05)
-        allowed = self._allowed(v_mps)
-        self._pace += min(max(allowed - self._pace, -change), change)
+        if tick % CONTROL_TICKS == 0:
+            self._share = self._allowed(v_mps)
+        self._pace += min(max(self._share - self._pace, -change), change)
         self._clock += self._pace
         self._waited_s = 0.0 if self._pace > 0.05 else self._waited_s + TICK_S
         return self._pace * self._wanted
@@ -64,7 +67,7 @@ class GivingWay:
             math.cos(pose[2]) * offsets[:, 0] + math.sin(pose[2]) * offsets[:, 1]
         )
         nearing = np.maximum(towards / np.hypot(*offsets.T), 0.0)  # share of the speed
-        room_m = np.maximum(gaps - _KEPT_OFF_M, 0.0)
+        room_m = np.maximum(gaps - _BESIDE_M - _KEPT_OFF_M * nearing, 0.0)
         speeds = nearing * abs(v_mps)
         most = np.sqrt(2.0 * self._brake_mps2 * room_m)
         return float(np.min(most / np.maximum(speeds, 1e-9), initial=1.0))

@@ -23,10 +23,12 @@ from sim.se2 import wrap
 from sim.worlds.world import World
 
 STEP_S = CONTROL_TICKS * TICK_S  # between two decisions of a person
-_AHEAD_M = 0.5  # along the way, of the point that is walked to
+_AHEAD = 2  # points along the way, of the one that is walked to
 _LOOK_S = 0.7  # how far ahead a step is judged
 _STUCK_STEPS = 75  # after which another place is sought
-_KEPT_OFF_M = 0.1  # from a robot that has come to rest
+_KEPT_OFF_M, _KEPT_OFF_AT_REST_M = 0.1, 0.02  # from a robot, beyond what it needs to stop
+_AT_REST_MPS = 0.01
+_PRESSED_M = 0.2  # gap to a robot below which people squeeze past one another
 _FIRST_M = 1.0  # between people, and from robots, at the start
 _PLACES_PER_M2 = 0.1  # places to walk to
 _TURNS = np.radians([0, 20, -20, 45, -45, 75, -75, 105, -105, 140, -140, 180])
@@ -42,7 +44,7 @@ class People:
     """Each walks at a speed of its own, drawn between this and the next (0.4 to 1.6 in corridors:
     Weidmann 1993, "Transporttechnik der Fussgänger")."""
     max_speed_mps: Positive = 1.2
-    stride_m: Positive = 0.9
+    stride_m: Positive = 0.7
     """Two steps: the legs swing a quarter of it to the front and the back."""
     leg_radius_m: Positive = 0.055
     legs_apart_m: Positive = 0.18
@@ -149,7 +151,8 @@ class Crowd:
         now = np.array(poses)[:, :2]
         speeds = np.hypot(*(now - self._last).T) / STEP_S
         self._last = now
-        stops_m = _KEPT_OFF_M + speeds**2 / (2.0 * np.array(self._brake_mps2))
+        stops_m = speeds**2 / (2.0 * np.array(self._brake_mps2))
+        stops_m += np.where(speeds > _AT_REST_MPS, _KEPT_OFF_M, _KEPT_OFF_AT_REST_M)
         obstacles = np.column_stack([now, self._reach_m, stops_m])
         state, radius_m = self._states[-1].copy(), self.people.radius_m
         targets = np.array([self._target(person, state[person, :2]) for person in range(len(state))])
@@ -157,6 +160,7 @@ class Crowd:
         moved = _walk(
             state, targets, self._speeds, obstacles,
             (ground.clear_m, ground.corner_m[0], ground.corner_m[1], ground.cell_m), radius_m,
+            self.people.torso_radius_m,
         )  # fmt: skip
         self._stuck = np.where(moved, np.maximum(self._stuck - 1, 0), self._stuck + 1)
         self._states.append(state)
@@ -168,11 +172,20 @@ class Crowd:
             away_m = np.hypot(*(way[:20] - at).T)
             way = way[int(np.argmin(away_m)) :]
         if len(way) == 0 or math.dist(at, way[-1]) < 0.2 or self._stuck[person] > _STUCK_STEPS:
+            # for somebody in the way of a robot: of several places, one that lies behind the back
+            tries = 8 if self._stuck[person] > _STUCK_STEPS else 1
+            every = [self._ways(self._choose()) for _ in range(tries)]
+            ways = every[0] if tries == 1 else max(every, key=lambda ways: self._lead(ways, at))
+            way = self._ground.way(ways, at)
             self._stuck[person] = 0
-            place = self._choose()
-            way = self._ground.way(self._ways(place), at)
         self._way[person] = way
-        return way[min(round(_AHEAD_M / 0.2), len(way) - 1)] if len(way) else at
+        return _ahead(way) if len(way) else at
+
+    def _lead(self, ways: Ways, at: Array) -> float:
+        """How much shorter the way to a place is from a point (2,) than from the nearest robot."""
+        spots = np.vstack([at, self._last[np.argmin(np.hypot(*(self._last - at).T))]])
+        mine, robots = (ways.cost[0, *self._ground.cell_of(spot)[0]] for spot in spots)
+        return float(robots - mine) if math.isfinite(mine) else -math.inf
 
     def _choose(self) -> int:
         """A place to walk to."""
@@ -193,7 +206,7 @@ class Crowd:
         low = np.minimum(steps.astype(np.int64), max(len(self._states) - 2, 0))
         high = np.minimum(low + 1, len(self._states) - 1)
         share = (steps - low)[..., None, None]
-        first, last = int(low.min(initial=0)), int(high.max(initial=0))
+        first, last = int(low.min()), int(high.max())
         states = np.array(self._states[first : last + 1])
         begin, end = states[low - first], states[high - first]
         found: Array = begin + share * (end - begin)
@@ -251,6 +264,12 @@ class Crowd:
         return bool(np.hypot(*outside.T).min() < self.people.radius_m)
 
 
+def _ahead(way: Array) -> Array:
+    """Point (2,) of a way (P, 2) to walk to."""
+    point: Array = way[min(_AHEAD, len(way) - 1)]
+    return point
+
+
 @njit()
 def _clear(field: tuple[Array, float, float, float], x: float, y: float) -> float:
     """No wall is nearer to a point than this, m."""
@@ -288,11 +307,13 @@ def _walk(
     obstacles: Array,
     field: tuple[Array, float, float, float],
     radius_m: float,
+    torso_m: float,
 ) -> Bools:
     """Move each person (n, 4) one step, in place; whether it came nearer to its target.
 
     Of steps in twelve directions, and none, the one that leads best to the target and to room. No
-    step is taken into a wall, nor to a robot or person that is too near already.
+    step is taken into a wall, nor to a robot or person that is too near already; close to a robot
+    people squeeze past one another.
     """
     progress = np.zeros(len(states), np.bool_)
     for i in range(len(states)):
@@ -302,16 +323,16 @@ def _walk(
         step_m, best, turn = speeds[i] * STEP_S, -0.4, np.nan
         if math.hypot(targets[i, 0] - x, targets[i, 1] - y) < 1e-6:
             best = 2.0  # nowhere to go
-        if gap < 0.0:
-            best = -10.0
+        if gap < _PRESSED_M:
+            best = -10.0  # rather any step than none
         for k in range(_TURNS.size):
             cos, sin = math.cos(wanted + _TURNS[k]), math.sin(wanted + _TURNS[k])
             nx, ny = x + step_m * cos, y + step_m * sin
             there = _robot_gap(obstacles, nx, ny, radius_m)
-            beside = _person_gap(states, i, nx, ny, radius_m)
+            beside = _person_gap(states, i, nx, ny, torso_m)
             if _clear(field, nx, ny) < radius_m or (there < 0.0 and there <= gap):
                 continue
-            if beside < 0.0 and beside <= apart:
+            if beside < 0.0 and beside <= apart and gap > _PRESSED_M:
                 continue
             look_m = speeds[i] * _LOOK_S
             lx, ly = x + look_m * cos, y + look_m * sin
