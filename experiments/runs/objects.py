@@ -249,7 +249,7 @@ class Objects:
     ) -> Callable[[Frame], Array]:
         """Start the estimator that the route's feedback names; it knows the start and the map."""
         estimator = self._steering()
-        prior = Prior(robot, sensors, start.copy(), np.zeros((3, 3)), world)
+        prior = Prior(robot, sensors, start.copy(), np.zeros((3, 3)), world.known)
         with blaming("route.feedback"):
             estimator.reset(prior, stream(self.config["seed"], "onboard"))
         return lambda frame: estimator.step(frame).mean
@@ -336,9 +336,8 @@ class Objects:
             return None
         if is_grid_file(wanted):
             return grid_file.read_grid(wanted)
-        return required(
-            recording.world, "prior.map=world, but the recording has no map; set prior.map=none"
-        )
+        complaint = "prior.map=world, but the recording has no map; set prior.map=none"
+        return required(recording.world, complaint).known
 
 
 def _true_start(recording: Recording) -> Array:

@@ -121,7 +121,7 @@ def check_size(rows: float, columns: float, what: str, remedy: str) -> None:
 
 def of_world(recording: Recording, resolution_m: float, z_m: float) -> OccupancyGrid:
     """Grid of the walls of a recording's world, for `prior.map`; see `rasterized`."""
-    return rasterize(recording.known_world, resolution_m, z_m)
+    return rasterize(recording.known_world.known, resolution_m, z_m)
 
 
 def rasterize(world: World, resolution_m: float, z_m: float) -> OccupancyGrid:

@@ -1,5 +1,6 @@
 """World: upright walls, point landmarks and named places, in the frame `map` (metres)."""
 
+import dataclasses
 import math
 from dataclasses import dataclass, field
 
@@ -43,6 +44,9 @@ class World:
         (3,) m, m, rad: where a robot starts unless its route says otherwise.
     waypoints
         (P, 2) m: a tour through free space that passes every kind of place.
+    known_walls, known_wall_z_m
+        (K, 4) and (K, 2) m: faces of the map of another day, which estimators get; None where
+        nothing has changed since. Landmarks are as they are driven past.
     """
 
     name: str
@@ -54,6 +58,8 @@ class World:
     places: dict[str, Array] = field(default_factory=dict)
     start_pose: Array = field(default_factory=lambda: np.zeros(3))
     waypoints: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    known_walls: Array | None = None
+    known_wall_z_m: Array | None = None
 
     def __post_init__(self) -> None:
         shapes = {
@@ -64,6 +70,9 @@ class World:
             "waypoints": (self.waypoints, (len(self.waypoints), 2)),
             **{f"places.{k}": (v, (len(v), 4)) for k, v in self.places.items()},
         }
+        if self.known_walls is not None and self.known_wall_z_m is not None:
+            shapes["known_walls"] = self.known_walls, (len(self.known_walls), 4)
+            shapes["known_wall_z_m"] = self.known_wall_z_m, (len(self.known_walls), 2)
         for key, (values, shape) in shapes.items():
             require(
                 np.shape(values) == shape,
@@ -81,10 +90,27 @@ class World:
             f"world {self.name}: descriptors must have shape (L, D), and look_alike (L,), of its "
             f"{len(self.landmarks)} landmarks",
         )
+        require(
+            (self.known_walls is None) == (self.known_wall_z_m is None),
+            f"world {self.name}: known_walls and known_wall_z_m go together",
+        )
         for bad in np.flatnonzero(np.hypot(*(self.walls[:, 2:] - self.walls[:, :2]).T) < 1e-6):
             raise InputError(f"world {self.name}: wall {bad} has no length; give it two ends")
         for bad in np.flatnonzero(self.wall_z_m[:, 0] >= self.wall_z_m[:, 1]):
             raise InputError(f"world {self.name}: wall {bad} has its top below its bottom")
+
+    @property
+    def known(self) -> "World":
+        """The world as its map has it, which may be of another day."""
+        if self.known_walls is None or self.known_wall_z_m is None:
+            return self
+        return dataclasses.replace(
+            self,
+            walls=self.known_walls,
+            wall_z_m=self.known_wall_z_m,
+            known_walls=None,
+            known_wall_z_m=None,
+        )
 
     @property
     def bounds_m(self) -> Array:
