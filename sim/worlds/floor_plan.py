@@ -276,6 +276,9 @@ class Plan:
     def _fits(self, corners: Array, faces: Array, paths: Array, clearance_m: float) -> bool:
         """Whether a convex object keeps off faces, paths and the other objects."""
         edges = np.hstack([corners, np.roll(corners, -1, axis=0)])
+        lowest, highest = corners.min(axis=0), corners.max(axis=0)
+        paths = _near(paths, lowest - clearance_m, highest + clearance_m)
+        faces = _near(faces, lowest - _APART_M, highest + _APART_M)
         if len(paths) and gaps_m(edges, paths).min() < clearance_m:
             return False
         if len(faces) and gaps_m(edges, faces).min() < _APART_M:
