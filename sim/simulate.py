@@ -298,10 +298,13 @@ class _Drive:
         body, logs, fire_every = self.body, self.logs, periods(self._member.sensors)
         slip = robot.start_slip(TICK_S, self._member.streams["slip"])
         encoder, travel = np.zeros(2), np.zeros(2)
+        sweeps = [firing for firing in self._firing.values() if firing.sweeps]
         tick, velocity, speeds = 0, (0.0, 0.0), (0.0, 0.0)
         while True:
             pose = body.pose
             pose.setflags(write=False)
+            for sweeping in sweeps:
+                sweeping.follow(tick / TICKS_PER_S, pose)
             due = [name for name, period in fire_every.items() if tick % period == 0]
             wanted = driver.command(tick, feedback.pose(tick, pose, encoder))
             if due or wanted is None:

@@ -3,12 +3,27 @@
 import dataclasses
 import math
 from dataclasses import dataclass, field
+from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.arrays import Array, Bools, Floats
+from sim.arrays import Array, Bools, Floats, Ints
 from sim.errors import InputError, require
+
+
+class Material(IntEnum):
+    """What a face is made of, as a laser sees it."""
+
+    PLASTER = 0
+    GLASS = 1
+    DARK = 2
+
+
+REMISSION = {Material.PLASTER: 0.8, Material.GLASS: 0.8, Material.DARK: 0.024}
+"""Share of the light that comes back at right angles: plaster, glass met so that it mirrors, and
+black foam rubber (SICK, LMS5xx operating instructions, 2021, sec. 3.6.4: plaster about 100 %, black
+foam rubber 2.4 %; paint takes a fifth)."""
 
 
 def facing_second(waypoints: Array) -> Array:
@@ -47,6 +62,8 @@ class World:
     known_walls, known_wall_z_m
         (K, 4) and (K, 2) m: faces of the map of another day, which estimators get; None where
         nothing has changed since. Landmarks are as they are driven past.
+    materials
+        (W,) `Material` of each face; None where all are plaster.
     """
 
     name: str
@@ -60,6 +77,7 @@ class World:
     waypoints: Array = field(default_factory=lambda: np.zeros((0, 2)))
     known_walls: Array | None = None
     known_wall_z_m: Array | None = None
+    materials: Ints | None = None
 
     def __post_init__(self) -> None:
         shapes = {
@@ -90,6 +108,12 @@ class World:
             f"world {self.name}: descriptors must have shape (L, D), and look_alike (L,), of its "
             f"{len(self.landmarks)} landmarks",
         )
+        if self.materials is not None:
+            require(
+                np.shape(self.materials) == (len(self.walls),)
+                and np.isin(self.materials, [*Material]).all(),
+                f"world {self.name}: materials must be numbers of Material, one a wall",
+            )
         require(
             (self.known_walls is None) == (self.known_wall_z_m is None),
             f"world {self.name}: known_walls and known_wall_z_m go together",
@@ -110,7 +134,14 @@ class World:
             wall_z_m=self.known_wall_z_m,
             known_walls=None,
             known_wall_z_m=None,
+            materials=None,
         )
+
+    def material_of(self, faces: Bools) -> Ints:
+        """Materials (N,) of the faces of a mask (W,)."""
+        if self.materials is None:
+            return np.zeros(int(faces.sum()), np.int64)
+        return self.materials[faces]
 
     @property
     def bounds_m(self) -> Array:
