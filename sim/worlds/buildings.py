@@ -80,6 +80,7 @@ def room(
     n_objects: int = 6,
     n_landmarks: int = 60,
     look_alike_share: float = 0.0,
+    changed_share: float = 0.0,
 ) -> World:
     """Build one furnished room; the tour goes round it, 1.2 m off the walls."""
     check_margins(length_m=length_m - 3.0, width_m=width_m - 3.0)
@@ -89,7 +90,13 @@ def room(
     a, b = 1.2, (length_m - 1.2, width_m - 1.2)
     plan.tour = [(a, a), (b[0], a), (b[0], b[1]), (a, b[1]), (a, a)]
     plan.furnish(rng, (0, 0), (length_m, width_m), n_objects, size_m=(0.3, 1.0), clearance_m=0.45)
-    return plan.world("room", rng, n_landmarks=n_landmarks, look_alike_share=look_alike_share)
+    return plan.world(
+        "room",
+        rng,
+        n_landmarks=n_landmarks,
+        look_alike_share=look_alike_share,
+        changed_share=changed_share,
+    )
 
 
 def boxes(
@@ -99,6 +106,7 @@ def boxes(
     side_m: float = 20.0,
     n_landmarks: int = 0,
     look_alike_share: float = 0.0,
+    changed_share: float = 0.0,
 ) -> World:
     """Scatter boxes in a square hall; the tour runs along its walls."""
     check_margins(side_m=side_m - 3.0)
@@ -107,7 +115,13 @@ def boxes(
     a, b = 1.2, side_m - 1.2
     plan.tour = [(a, a), (b, a), (b, b), (a, b), (a, a)]
     plan.furnish(rng, (0, 0), (side_m, side_m), n_boxes, clearance_m=0.5)
-    return plan.world("boxes", rng, n_landmarks=n_landmarks, look_alike_share=look_alike_share)
+    return plan.world(
+        "boxes",
+        rng,
+        n_landmarks=n_landmarks,
+        look_alike_share=look_alike_share,
+        changed_share=changed_share,
+    )
 
 
 @options("world")
@@ -128,6 +142,9 @@ class Rooms:
     """Share of the landmarks on walls; the others are on objects."""
     look_alike_share: Share = 0.0
     """Share of the landmarks that look like another one."""
+    changed_share: Share = 0.0
+    """Share of the objects that have changed since the map was made that estimators get: a third of
+    them stand elsewhere in it, are not in it, and have another like them beside."""
 
     def __post_init__(self) -> None:
         require(
@@ -160,6 +177,7 @@ class Rooms:
             n_landmarks=self.n_landmarks,
             on_walls_share=self.on_walls_share,
             look_alike_share=self.look_alike_share,
+            changed_share=self.changed_share,
         )
 
 
@@ -184,6 +202,9 @@ class Corridor:
     n_landmarks: NonNegativeInt = 80
     look_alike_share: Share = 0.0
     """Share of the landmarks that look like another one."""
+    changed_share: Share = 0.0
+    """Share of the objects that have changed since the map was made that estimators get: a third of
+    them stand elsewhere in it, are not in it, and have another like them beside."""
 
     def __post_init__(self) -> None:
         check_margins(
@@ -227,14 +248,22 @@ class Corridor:
             rng,
             n_landmarks=self.n_landmarks,
             look_alike_share=self.look_alike_share,
+            changed_share=self.changed_share,
         )
 
 
-def corridors(*, rng: np.random.Generator, n_objects: list[int], **lengths_m: list[float]) -> World:
+def corridors(
+    *,
+    rng: np.random.Generator,
+    n_objects: list[int],
+    changed_share: float = 0.0,
+    **lengths_m: list[float],
+) -> World:
     """Build a `Corridor` whose sizes are drawn, each between the two ends given."""
     drawn = {name: rng.uniform(ends[0], ends[1]) for name, ends in lengths_m.items()}
     count = int(rng.integers(n_objects[0], n_objects[1] + 1))
-    return build(Corridor, {**drawn, "n_objects": count, "n_landmarks": 0}, "world").build(rng)
+    own = {"n_objects": count, "n_landmarks": 0, "changed_share": changed_share}
+    return build(Corridor, {**drawn, **own}, "world").build(rng)
 
 
 def office(
@@ -245,6 +274,7 @@ def office(
     look_alike_share: float = 0.1,
     objects_per_room: int = 5,
     rooms_visited: int = 8,
+    changed_share: float = 0.0,
 ) -> World:
     """Build an office floor of 66 x 42 m: 22 furnished rooms on two corridor loops.
 
@@ -293,7 +323,13 @@ def office(
         _line_up(plan, rng, low, high, 7, keep_off=doors)
     for room in rooms:
         plan.furnish(rng, room.low, room.high, objects_per_room, size_m=(0.4, 1.6))
-    return plan.world("office", rng, n_landmarks=n_landmarks, look_alike_share=look_alike_share)
+    return plan.world(
+        "office",
+        rng,
+        n_landmarks=n_landmarks,
+        look_alike_share=look_alike_share,
+        changed_share=changed_share,
+    )
 
 
 def streets(

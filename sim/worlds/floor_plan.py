@@ -1,18 +1,21 @@
 """A plan on which builders draw: walls, boxes, doors, objects clear of the tour, landmarks."""
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from sim.arrays import Array, ArrayLike, Bools, Floats
 from sim.errors import InputError, require
+from sim.se2 import transform
 from sim.worlds.world import World, facing_second
 
 WALL_HEIGHT_M = 2.5
 DESCRIPTOR_SIZE = 128
+CHORD_ERROR_M = 1e-4  # between a polygon and what is round
 _APART_M = 0.12  # between furniture and walls, and among furniture
+_MOVES_TRIED = 50
 _PROUD_M = 0.01  # landmarks stand this far off their face, so that rays see them from its side
 
 
@@ -24,6 +27,8 @@ class Plan:
     ----------
     faces, heights, on_object
         x1, y1, x2, y2 of each face; its bottom and top; whether it belongs to an object.
+    objects
+        First row of the faces of each object, and the row after its last.
     floors
         Outlines of the ground one can stand on; none drawn means everywhere.
     solids
@@ -40,6 +45,7 @@ class Plan:
     faces: list[tuple[float, ...]] = field(default_factory=list)
     heights: list[tuple[float, float]] = field(default_factory=list)
     on_object: list[bool] = field(default_factory=list)
+    objects: list[tuple[int, int]] = field(default_factory=list)
     floors: list[Array] = field(default_factory=list)
     solids: list[tuple[Array, float]] = field(default_factory=list)
     discs: list[tuple[float, float, float]] = field(default_factory=list)
@@ -84,10 +90,22 @@ class Plan:
         self.place("door", x - 0.6, y - 0.6, x + 0.6, y + 0.6)
 
     def prism(
-        self, corners: ArrayLike, bottom_m: float, top_m: float, *, on_object: bool = True
+        self,
+        corners: ArrayLike,
+        bottom_m: float,
+        top_m: float,
+        *,
+        on_object: bool = True,
+        joined: bool = False,
     ) -> None:
-        """Draw the faces of an upright prism over corners (N, 2), counter-clockwise."""
+        """Draw the faces of an upright prism over corners (N, 2), counter-clockwise.
+
+        One that is `joined` belongs to the object drawn before, as the legs of a table do.
+        """
         ring = np.asarray(corners, float)
+        if on_object:
+            first = self.objects.pop()[0] if joined else len(self.faces)
+            self.objects.append((first, len(self.faces) + len(ring)))
         for (x1, y1), (x2, y2) in zip(ring, np.roll(ring, -1, axis=0), strict=True):
             self._face((x1, y1, x2, y2), (bottom_m, top_m), on_object=on_object)
         self.close(ring, top_m)
@@ -126,19 +144,55 @@ class Plan:
         InputError
             If so many do not fit.
         """
+
+        def outline(rng: np.random.Generator) -> Array:
+            size = rng.uniform(*size_m, size=2)
+            yaw = rng.uniform(0.0, math.pi) if rng.random() < 0.6 else 0.0
+            return box_corners((0.0, 0.0), size, yaw)
+
+        def draw(corners: Array, rng: np.random.Generator) -> None:
+            self.prism(corners, 0.0, rng.uniform(*height_m))
+
+        self.put(rng, (low, high), count, outline, draw, clearance_m=clearance_m, tries=tries)
+
+    def put(
+        self,
+        rng: np.random.Generator,
+        area: tuple[ArrayLike, ArrayLike],
+        count: int,
+        outline: Callable[[np.random.Generator], Array],
+        draw: Callable[[Array, np.random.Generator], None],
+        *,
+        clearance_m: float,
+        tries: int = 600,
+    ) -> None:
+        """Put `count` objects into a rectangle from its low to its high corner, as `furnish` does.
+
+        Parameters
+        ----------
+        outline
+            Gives the corners (N, 2) of a convex outline about the origin, counter-clockwise.
+        draw
+            Draws what stands within an outline (N, 2).
+
+        Raises
+        ------
+        InputError
+            If so many do not fit.
+        """
         require(count >= 0, f"world: the number of objects must be zero or more, got {count}")
-        least, most = np.array(low, float), np.array(high, float)
+        least, most = np.array(area[0], float), np.array(area[1], float)
         paths = _near(self._paths(), least - clearance_m, most + clearance_m)
         faces = _near(np.array(self.faces, float).reshape(-1, 4), least, most)
         for placed in range(count):
             for _ in range(tries):
-                size = rng.uniform(*size_m, size=2)
-                yaw = rng.uniform(0.0, math.pi) if rng.random() < 0.6 else 0.0
-                corners = box_corners(rng.uniform(least, most).tolist(), size, yaw)
+                corners = outline(rng)
+                corners = corners + rng.uniform(least, most)
                 within = np.all((corners > least + _APART_M) & (corners < most - _APART_M))
                 if within and self._fits(corners, faces, paths, clearance_m):
-                    self.prism(corners, 0.0, rng.uniform(*height_m))
-                    faces = np.vstack([faces, self.faces[-4:]])
+                    draw(corners, rng)
+                    edges = np.hstack([corners, np.roll(corners, -1, axis=0)])
+                    faces = np.vstack([faces, edges])
                     break
             else:
                 width, depth = most - least
@@ -150,7 +204,7 @@ class Plan:
     def tree(self, x: float, y: float, trunk_m: float, crown_m: float, top_m: float) -> None:
         """Draw a tree: a trunk, and a crown from 2.2 m up."""
         self.prism(regular((x, y), trunk_m, 6), 0.0, 2.2)
-        self.prism(regular((x, y), crown_m, 8), 2.2, top_m)
+        self.prism(regular((x, y), crown_m, 8), 2.2, top_m, joined=True)
 
     def world(
         self,
@@ -160,8 +214,13 @@ class Plan:
         n_landmarks: int = 0,
         on_walls_share: float = 0.7,
         look_alike_share: float = 0.0,
+        changed_share: float = 0.0,
     ) -> World:
-        """Finish the world, with landmarks scattered over its faces."""
+        """Finish the world, with landmarks scattered over its faces.
+
+        `changed_share` of its objects stand elsewhere on the map that estimators get, or are on it
+        or in the world alone.
+        """
         walls = np.array(self.faces, float).reshape(-1, 4)
         heights = np.array(self.heights, float).reshape(-1, 2)
         landmarks = self._landmarks(rng, n_landmarks, on_walls_share)
@@ -171,7 +230,37 @@ class Plan:
         # The smallest first, so that a door is not taken for the room it leads to.
         places = {k: np.array(v, float) for k, v in self.places.items()}
         places = dict(sorted(places.items(), key=lambda item: _mean_area(item[1])))
-        return World(name, walls, heights, landmarks, descriptors, alike, places, start, tour)
+        known = self._of_another_day(rng, changed_share)
+        return World(
+            name, walls, heights, landmarks, descriptors, alike, places, start, tour, *known
+        )
+
+    def _of_another_day(
+        self, rng: np.random.Generator, share: float
+    ) -> tuple[Array, Array] | tuple[None, None]:
+        """Faces (K, 4) and heights (K, 2) with a share of the objects changed.
+
+        A third of them each are somewhere else in the same room, are missing, and have another like
+        them near by. The generator's own stream is left as it is.
+        """
+        require(0.0 <= share <= 1.0, f"world.changed_share must lie in [0, 1], got {share}")
+        if share == 0.0 or not self.objects:
+            return None, None
+        (rng,) = rng.spawn(1)
+        faces, heights = np.array(self.faces), np.array(self.heights)
+        fixed = faces[~np.array(self.on_object)]
+        kept = np.ones(len(faces), bool)
+        added: list[tuple[Array, Array]] = []
+        changed = rng.permutation(len(self.objects))[: round(share * len(self.objects))]
+        for number, which in enumerate(changed):
+            rows = slice(*self.objects[which])
+            kept[rows] = number % 3 == 2  # of these another one is added
+            if number % 3 != 1:
+                added.append((_moved_near(faces[rows], fixed, rng), heights[rows]))
+        return (
+            np.concatenate([faces[kept], *(moved for moved, _ in added)]),
+            np.concatenate([heights[kept], *(own for _, own in added)]),
+        )
 
     def _face(self, ends: Sequence[float], height: tuple[float, float], *, on_object: bool) -> None:
         self.faces.append(tuple(map(float, ends)))
@@ -187,6 +276,9 @@ class Plan:
     def _fits(self, corners: Array, faces: Array, paths: Array, clearance_m: float) -> bool:
         """Whether a convex object keeps off faces, paths and the other objects."""
         edges = np.hstack([corners, np.roll(corners, -1, axis=0)])
+        lowest, highest = corners.min(axis=0), corners.max(axis=0)
+        paths = _near(paths, lowest - clearance_m, highest + clearance_m)
+        faces = _near(faces, lowest - _APART_M, highest + _APART_M)
         if len(paths) and gaps_m(edges, paths).min() < clearance_m:
             return False
         if len(faces) and gaps_m(edges, faces).min() < _APART_M:
@@ -250,6 +342,20 @@ class Plan:
         for ring, top in self.solids:
             free &= ~(inside(points[:, :2], ring) & (points[:, 2] < top))
         return free
+
+
+def _moved_near(faces: Array, walls: Array, rng: np.random.Generator) -> Array:
+    """Faces (N, 4) of an object, turned and moved by up to 1.5 m within the room with walls."""
+    ends = faces.reshape(-1, 2)
+    centre = ends.mean(axis=0)
+    for _ in range(_MOVES_TRIED):
+        angle, way = rng.uniform(-math.pi, math.pi, 2)
+        shift = rng.uniform(0.4, 1.5) * np.array([math.cos(way), math.sin(way)])
+        moved = transform([*(centre + shift), angle], ends - centre).reshape(-1, 4)
+        through = np.concatenate([centre, centre + shift])[None]
+        if not len(walls) or gaps_m(np.vstack([moved, through]), walls).min() > 0.02:
+            return moved
+    return faces
 
 
 def rectangle_corners(low: Sequence[float], high: Sequence[float]) -> Array:
@@ -319,10 +425,27 @@ def box_corners(centre: Sequence[float], size: Sequence[float] | Array, yaw_rad:
     return np.asarray(half @ np.array([[cos, sin], [-sin, cos]]) + np.asarray(centre))
 
 
-def regular(centre: Sequence[float], radius_m: float, sides: int) -> Array:
+def regular(centre: Sequence[float] | Array, radius_m: float, sides: int) -> Array:
     """Corners (sides, 2) of a regular polygon, m, counter-clockwise."""
     angle = 2.0 * math.pi * np.arange(sides) / sides
     return np.asarray(centre) + radius_m * np.stack([np.cos(angle), np.sin(angle)], 1)
+
+
+def arc_step_rad(radius_m: float) -> float:
+    """Angle between corners on an arc whose chords are off it by less than 0.1 mm."""
+    return 2.0 * math.acos(max(1.0 - 0.95 * CHORD_ERROR_M / radius_m, 0.0))
+
+
+def round_corners(centre: Sequence[float] | Array, radius_m: float) -> Array:
+    """Corners (N, 2), m, counter-clockwise, of something round: chords err by less than 0.1 mm."""
+    return regular(centre, radius_m, max(math.ceil(2.0 * math.pi / arc_step_rad(radius_m)), 8))
+
+
+def arc_points(centre: Sequence[float] | Array, radius_m: float, ends_rad: Sequence[float]) -> Array:
+    """Points (N, 2), m, on an arc between two angles, ends included."""
+    sweep = abs(ends_rad[1] - ends_rad[0])
+    angle = np.linspace(*ends_rad, max(math.ceil(sweep / arc_step_rad(radius_m)), 1) + 1)
+    return np.asarray(centre) + radius_m * np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
 def make_descriptors(
