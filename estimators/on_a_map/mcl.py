@@ -4,13 +4,16 @@ Particles roll by the wheels, are weighted by a likelihood field, and are resamp
 follows the spread of the belief: as many as the bins of pose that they fall into call for (KLD
 sampling; Fox 2003).
 
-The filter may be lost, and two ways back are offered. `average`: when scans fit worse than their
-long-term average, particles are injected over all the floor (augmented MCL), drawn by the scan
-(sensor resetting). `rivals`: a set of particles drawn by a scan over all the floor, and as many
-drawn from the belief, follow the same wheels and scans for a while; if the best path of the rivals
-explains them better than the best of the defenders by a margin, the rivals become the belief.
-People before the laser and what the map lacks count against both alike, which an average over time
-mistakes for being lost.
+The likelihood of a beam is bounded (see `likelihood_field`), so people and moved furniture, which
+the map lacks, cannot outweigh the walls. It is wide while the belief is wide, and sharp after that.
+
+The filter may be lost, and two ways back are offered. `rivals`: a set of particles drawn by a scan
+over all the floor, and as many drawn from the belief, follow the same wheels and scans for a while;
+if the best path of the rivals explains them better than the best of the defenders by a margin, the
+rivals become the belief. People and what the map lacks count against both alike. `average`: when
+scans fit worse than their long-term average, particles are injected over all the floor (augmented
+MCL), drawn by the scan (sensor resetting). It takes people for being lost, and each of up to
+`max_particles` injected costs `tries` poses to draw.
 """
 
 import math
@@ -187,9 +190,9 @@ class Mcl(MclOptions):
     -----
     `amcl_alphas` converts kr and kl for AMCL.
 
-    The defaults are for finding the robot anywhere: blunt likelihoods and a jitter that widens the
-    belief to twice its error or more. A tracker that knows its error wants beam_power=1,
-    min_ess=0, sigma_m of 0.05 to 0.1, and no jitter; it is consistent then.
+    The defaults find the robot anywhere and keep it among people; tempering and jitter make the
+    belief wider than its error. A tracker that knows its error wants beam_power=1, min_ess=0,
+    sigma_m of 0.05, and no jitter; it is consistent then.
 
     Without a start pose the particles are drawn by the first scan, and later ones are injected by
     the current one: along a corridor, where long beams fix the heading closely, a uniform draw

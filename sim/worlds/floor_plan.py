@@ -441,7 +441,9 @@ def round_corners(centre: Sequence[float] | Array, radius_m: float) -> Array:
     return regular(centre, radius_m, max(math.ceil(2.0 * math.pi / arc_step_rad(radius_m)), 8))
 
 
-def arc_points(centre: Sequence[float] | Array, radius_m: float, ends_rad: Sequence[float]) -> Array:
+def arc_points(
+    centre: Sequence[float] | Array, radius_m: float, ends_rad: Sequence[float]
+) -> Array:
     """Points (N, 2), m, on an arc between two angles, ends included."""
     sweep = abs(ends_rad[1] - ends_rad[0])
     angle = np.linspace(*ends_rad, max(math.ceil(sweep / arc_step_rad(radius_m)), 1) + 1)

@@ -364,6 +364,25 @@ def test_unknown_is_no_floor_and_as_likely_as_free(yaw):
         likelihood_field(OccupancyGrid(np.zeros((3, 3), np.float32), 0.1), LASER, FieldOptions())
 
 
+def test_the_unknown_behind_a_wall_does_not_draw_the_robot_to_it():
+    """Beams that err by more than sigma_m, before a wall with unknown space behind.
+
+    At 1 / z_max there (5.6 m), and a tenth of that in free space, the likeliest pose is 12 mm too
+    far forward, since ends behind the wall lose less than ends before it.
+    """
+    values = np.zeros((80, 120), np.float32)
+    values[40], values[41:] = 1.0, np.nan
+    grid = OccupancyGrid(values, 0.05, np.zeros(3))
+    field = likelihood_field(grid, LASER, FieldOptions(cell_m=0.01))
+    rng = np.random.default_rng(0)
+    ends = np.column_stack([rng.uniform(2.0, 4.0, 20_000), rng.normal(2.025, 0.15, 20_000)])
+    shifts_m = np.linspace(-0.05, 0.05, 101)
+    poses = np.column_stack([np.zeros(101), shifts_m, np.zeros(101)])
+    at = field.log_likelihood(poses, np.ascontiguousarray(ends.T, np.float32))
+    peak = np.polyfit(shifts_m, at, 2)
+    assert abs(-0.5 * peak[1] / peak[0]) < 0.004
+
+
 def test_mcl_on_a_grid_is_about_as_good_as_on_walls():
     recording = circle(n_frames=200)
     errors = []
