@@ -344,8 +344,10 @@ class Mcl(MclOptions):
             of_scan = self._search_field.log_likelihood(self._contest[side], ends)
             power = self._power(np.zeros(n), of_scan, self.min_ess * n)
             drawn = resample(power * of_scan, n, self._rng, self.resampling)
-            self._explained[side] = (self._explained[side] + of_scan)[drawn]
-            self._contest[side] = self._jittered(self._contest[side][drawn])
+            poses = self._contest[side][drawn]
+            sharp = self._field.log_likelihood(poses, ends)
+            self._explained[side] = self._explained[side][drawn] + sharp
+            self._contest[side] = self._jittered(poses)
         self._n_explained += ends.shape[1]
         self._n_contested += 1
         if self._n_contested < self.rival_scans:
