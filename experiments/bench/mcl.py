@@ -118,7 +118,7 @@ def _follow(experiment: Experiment) -> tuple[bool, float, float]:
     off_rad = np.abs(heading_errors_rad(poses, estimate.means))
     laser, log = recording.sensor("laser", Laser), recording.log("laser")
     eyes = se2.compose(recording.truth_at(log.stamps), laser.mount.pose)
-    expected_m = SegmentCaster(prior.map, laser).cast_many(eyes)
+    expected_m = SegmentCaster(recording.known_world.known, laser).cast_many(eyes)
     short = float(np.mean(log["ranges_m"] < expected_m - 0.1))
     kept = off_m.max() < _KEPT_M and off_rad.max() < _KEPT_RAD
     return bool(kept), float(np.sqrt(np.mean(off_m**2))), short
