@@ -118,10 +118,21 @@ def options(where: str) -> Callable[[type[T]], type[T]]:
         )
         del made.__signature__
         made.__init__ = checked
+        made.__setattr__ = _set_state
         made._place = where
         return cast("type[T]", made)
 
     return decorate
+
+
+def _set_state(self: Any, name: str, value: Any) -> None:
+    """Let a method keep a state, not change its options.
+
+    The dataclass's own goes through every class that is inherited: 4 us a value, in every step.
+    """
+    if name in type(self).__dataclass_fields__ or "_place" in vars(type(self)):
+        raise dataclasses.FrozenInstanceError(f"cannot assign to field {name!r}")
+    object.__setattr__(self, name, value)
 
 
 def build(cls: type[T], settings: Mapping[str, Any], where: str) -> T:
@@ -151,7 +162,8 @@ def build(cls: type[T], settings: Mapping[str, Any], where: str) -> T:
     values: dict[str, Any] = {}
     for key, value in settings.items():
         place = f"{where}.{key}"
-        require(key in fields, describe_unknown(key, fields, where))
+        if key not in fields:
+            raise InputError(describe_unknown(key, fields, where))
         values[key] = _fitted(value, kinds[key], place, check=own is None)
     for name, f in fields.items():
         bare = f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING

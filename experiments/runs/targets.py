@@ -53,10 +53,8 @@ def check_target(
     open_ended = any(p.kind is p.VAR_KEYWORD for p in known.values())
     free = [name for name in known if name not in injected]
     for key in settings:
-        require(
-            open_ended or key in known or key == "_target_",
-            describe_unknown(key, free, where),
-        )
+        if not open_ended and key not in known and key != "_target_":
+            raise InputError(describe_unknown(key, free, where))
     for name, parameter in known.items():
         if name in settings:
             kind = getattr(parameter.annotation, "__name__", str(parameter.annotation))
