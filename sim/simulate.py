@@ -157,6 +157,10 @@ def record_team(
     require(
         rays != "bullet" or physics == "bullet", "rays=bullet needs physics=bullet; set rays=exact"
     )
+    require(
+        rays != "bullet" or world.materials is None,
+        f"world {world.name} has walls of glass or dark ones; set rays=exact",
+    )
     for member in members:
         periods(member.sensors)  # checks them before anything is built
     starts = [member.route.start(world, member.robot) for member in members]

@@ -61,9 +61,7 @@ class People:
             self.min_speed_mps <= self.max_speed_mps,
             "people.min_speed_mps must not be above people.max_speed_mps",
         )
-        require(
-            self.legs_top_m < self.height_m, "people.legs_top_m must be below people.height_m"
-        )
+        require(self.legs_top_m < self.height_m, "people.legs_top_m must be below people.height_m")
 
     @property
     def radius_m(self) -> float:
@@ -155,7 +153,9 @@ class Crowd:
         stops_m += np.where(speeds > _AT_REST_MPS, _KEPT_OFF_M, _KEPT_OFF_AT_REST_M)
         obstacles = np.column_stack([now, self._reach_m, stops_m])
         state, radius_m = self._states[-1].copy(), self.people.radius_m
-        targets = np.array([self._target(person, state[person, :2]) for person in range(len(state))])
+        targets = np.array(
+            [self._target(person, state[person, :2]) for person in range(len(state))]
+        )
         ground = self._ground
         moved = _walk(
             state, targets, self._speeds, obstacles,

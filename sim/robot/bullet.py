@@ -142,9 +142,7 @@ class BulletBody(contextlib.AbstractContextManager["BulletBody"]):
         """
         return self.strike(starts, ends, ground=ground)[0]
 
-    def strike(
-        self, starts: Array, ends: Array, *, ground: bool = False
-    ) -> tuple[Array, Array]:
+    def strike(self, starts: Array, ends: Array, *, ground: bool = False) -> tuple[Array, Array]:
         """Shares (N,) as of `cast`, and the normals (N, 3) of what stops the rays."""
         mask = _WALLS | _GROUND if ground else _WALLS
         shares, normals = np.empty(len(starts)), np.empty((len(starts), 3))

@@ -19,7 +19,10 @@ class ExactRays:
     """The caster of `sim.sensors.casting`, imported only where it is used: it needs a compiler."""
 
     def __init__(self, world: World) -> None:
-        self._world = world
+        self._world, self._opaque = world, world
+        if world.materials is not None:
+            solid = world.materials != Material.GLASS
+            self._opaque = World(world.name, world.walls[solid], world.wall_z_m[solid])
         self._casters: dict[Any, Any] = {}
 
     def scan(self, scanner: Any, pose: Array) -> Array:
@@ -40,7 +43,7 @@ class ExactRays:
         """Whether nothing stands between a point (3,) and each of others (K, 3)."""
         from sim.sensors.casting import visible
 
-        return visible(self._world, origin, points)
+        return visible(self._opaque, origin, points)
 
     def hits(self, scanner: Any, eyes: Array, bearings_rad: Array, stamps: Array) -> Hits:
         """What beams (B,) hit, each with its own pose of the scanner (B, 3), bearing and time."""

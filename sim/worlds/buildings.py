@@ -17,6 +17,7 @@ from sim.arrays import Array
 from sim.errors import InputError, require, required
 from sim.options import Count, NonNegative, Positive, Share, build, options
 from sim.worlds.floor_plan import WALL_HEIGHT_M, Plan, box_corners, check_margins, rectangle_corners
+from sim.worlds.furnished import FurnishedOptions
 from sim.worlds.grid_file import read_grid
 from sim.worlds.town import lawn, terrace, town
 from sim.worlds.world import World, facing_second
@@ -125,7 +126,7 @@ def boxes(
 
 
 @options("world")
-class Rooms:
+class Rooms(FurnishedOptions):
     """n_x by n_y square rooms with a door between all neighbours.
 
     The tour goes from room to room: round the outer ring, then, where there is one, round the
@@ -140,11 +141,6 @@ class Rooms:
     n_landmarks: NonNegativeInt = 200
     on_walls_share: Share = 0.7
     """Share of the landmarks on walls; the others are on objects."""
-    look_alike_share: Share = 0.0
-    """Share of the landmarks that look like another one."""
-    changed_share: Share = 0.0
-    """Share of the objects that have changed since the map was made that estimators get: a third of
-    them stand elsewhere in it, are not in it, and have another like them beside."""
 
     def __post_init__(self) -> None:
         require(
@@ -171,18 +167,11 @@ class Rooms:
         plan.tour = [((i + 0.5) * room_m, (j + 0.5) * room_m) for i, j in _grid_tour(n_x, n_y)]
         for low in corners:
             plan.furnish(rng, low, np.add(low, room_m).tolist(), self.objects_per_room)
-        return plan.world(
-            "rooms",
-            rng,
-            n_landmarks=self.n_landmarks,
-            on_walls_share=self.on_walls_share,
-            look_alike_share=self.look_alike_share,
-            changed_share=self.changed_share,
-        )
+        return self.finish(plan, "rooms", rng, self.on_walls_share)
 
 
 @options("world")
-class Corridor:
+class Corridor(FurnishedOptions):
     """A bare stretch, objects, a bare stretch, a sharp bend, a leg, a round curve, a leg.
 
     Both turn left. The place `corridor_bare` stops 3 m short of the end wall and of the objects,
@@ -200,11 +189,6 @@ class Corridor:
     width_m: float = 2.2
     n_objects: NonNegativeInt = 8
     n_landmarks: NonNegativeInt = 80
-    look_alike_share: Share = 0.0
-    """Share of the landmarks that look like another one."""
-    changed_share: Share = 0.0
-    """Share of the objects that have changed since the map was made that estimators get: a third of
-    them stand elsewhere in it, are not in it, and have another like them beside."""
 
     def __post_init__(self) -> None:
         check_margins(
@@ -243,13 +227,7 @@ class Corridor:
         middle = [(float(x), float(y)) for x, y in centre + r * arc]
         plan.tour = [(1.0, w / 2), (xc, w / 2), *middle, (far + 1.0, top + r)]
         _line_up(plan, rng, (x1, 0), (end, w), self.n_objects)
-        return plan.world(
-            "corridor",
-            rng,
-            n_landmarks=self.n_landmarks,
-            look_alike_share=self.look_alike_share,
-            changed_share=self.changed_share,
-        )
+        return self.finish(plan, "corridor", rng)
 
 
 def corridors(

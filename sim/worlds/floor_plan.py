@@ -6,16 +6,17 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from sim.arrays import Array, ArrayLike, Bools, Floats
+from sim.arrays import Array, ArrayLike, Bools, Floats, Ints
 from sim.errors import InputError, require
 from sim.se2 import transform
-from sim.worlds.world import World, facing_second
+from sim.worlds.world import Material, World, facing_second
 
 WALL_HEIGHT_M = 2.5
 DESCRIPTOR_SIZE = 128
 CHORD_ERROR_M = 1e-4  # between a polygon and what is round
 _APART_M = 0.12  # between furniture and walls, and among furniture
 _MOVES_TRIED = 50
+_STRETCH_M = 2.0  # of a wall of one material, at least
 _PROUD_M = 0.01  # landmarks stand this far off their face, so that rays see them from its side
 
 
@@ -215,11 +216,14 @@ class Plan:
         on_walls_share: float = 0.7,
         look_alike_share: float = 0.0,
         changed_share: float = 0.0,
+        glass_share: float = 0.0,
+        dark_share: float = 0.0,
     ) -> World:
         """Finish the world, with landmarks scattered over its faces.
 
         `changed_share` of its objects stand elsewhere on the map that estimators get, or are on it
-        or in the world alone.
+        or in the world alone. Of the walls, by stretches of 2 m or whole faces, some are of glass
+        and some dark.
         """
         walls = np.array(self.faces, float).reshape(-1, 4)
         heights = np.array(self.heights, float).reshape(-1, 2)
@@ -230,10 +234,28 @@ class Plan:
         # The smallest first, so that a door is not taken for the room it leads to.
         places = {k: np.array(v, float) for k, v in self.places.items()}
         places = dict(sorted(places.items(), key=lambda item: _mean_area(item[1])))
-        known = self._of_another_day(rng, changed_share)
+        earlier, stuff = rng.spawn(2)  # which leaves the generator's own stream as it is
+        known = self._of_another_day(earlier, changed_share)
+        materials = self._materials(stuff, glass_share, dark_share)
         return World(
-            name, walls, heights, landmarks, descriptors, alike, places, start, tour, *known
+            name, walls, heights, landmarks, descriptors, alike, places, start, tour, *known,
+            materials,
+        )  # fmt: skip
+
+    def _materials(self, rng: np.random.Generator, glass: float, dark: float) -> Ints | None:
+        """Material (W,) of each face; None if all are plaster."""
+        require(
+            0.0 <= glass <= 1.0 and 0.0 <= dark <= 1.0 and glass + dark <= 1.0,
+            f"world.glass_share and dark_share must be shares of one whole, got {glass}, {dark}",
         )
+        if glass + dark == 0.0:
+            return None
+        faces = np.array(self.faces)
+        along_m = np.cumsum(np.hypot(*(faces[:, 2:] - faces[:, :2]).T))
+        stretch = (along_m / _STRETCH_M).astype(np.int64)
+        drawn = rng.random(stretch[-1] + 1)[stretch]
+        kinds = np.select([drawn < glass, drawn < glass + dark], [Material.GLASS, Material.DARK], 0)
+        return np.where(self.on_object, Material.PLASTER, kinds).astype(np.int64)
 
     def _of_another_day(
         self, rng: np.random.Generator, share: float
@@ -241,12 +263,11 @@ class Plan:
         """Faces (K, 4) and heights (K, 2) with a share of the objects changed.
 
         A third of them each are somewhere else in the same room, are missing, and have another like
-        them near by. The generator's own stream is left as it is.
+        them near by.
         """
         require(0.0 <= share <= 1.0, f"world.changed_share must lie in [0, 1], got {share}")
         if share == 0.0 or not self.objects:
             return None, None
-        (rng,) = rng.spawn(1)
         faces, heights = np.array(self.faces), np.array(self.heights)
         fixed = faces[~np.array(self.on_object)]
         kept = np.ones(len(faces), bool)
@@ -358,7 +379,7 @@ def _moved_near(faces: Array, walls: Array, rng: np.random.Generator) -> Array:
     return faces
 
 
-def rectangle_corners(low: Sequence[float], high: Sequence[float]) -> Array:
+def rectangle_corners(low: Sequence[float] | Array, high: Sequence[float] | Array) -> Array:
     """Corners (4, 2), m, counter-clockwise."""
     return np.array([(low[0], low[1]), (high[0], low[1]), (high[0], high[1]), (low[0], high[1])])
 
@@ -418,7 +439,9 @@ def _mean_area(rectangles: Array) -> float:
     return float(np.mean(np.prod(rectangles[:, 2:] - rectangles[:, :2], axis=1)))
 
 
-def box_corners(centre: Sequence[float], size: Sequence[float] | Array, yaw_rad: float) -> Array:
+def box_corners(
+    centre: Sequence[float] | Array, size: Sequence[float] | Array, yaw_rad: float
+) -> Array:
     """Corners (4, 2), m, counter-clockwise."""
     half = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * np.asarray(size) / 2
     cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
@@ -441,10 +464,14 @@ def round_corners(centre: Sequence[float] | Array, radius_m: float) -> Array:
     return regular(centre, radius_m, max(math.ceil(2.0 * math.pi / arc_step_rad(radius_m)), 8))
 
 
-def arc_points(centre: Sequence[float] | Array, radius_m: float, ends_rad: Sequence[float]) -> Array:
+def arc_points(
+    centre: Sequence[float] | Array, radius_m: float, ends_rad: Sequence[float]
+) -> Array:
     """Points (N, 2), m, on an arc between two angles, ends included."""
     sweep = abs(ends_rad[1] - ends_rad[0])
-    angle = np.linspace(*ends_rad, max(math.ceil(sweep / arc_step_rad(radius_m)), 1) + 1)
+    angle = np.linspace(
+        ends_rad[0], ends_rad[1], max(math.ceil(sweep / arc_step_rad(radius_m)), 1) + 1
+    )
     return np.asarray(centre) + radius_m * np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
