@@ -19,6 +19,7 @@ from sim.options import Count, NonNegative, Positive, Share, build, options
 from sim.worlds.floor_plan import WALL_HEIGHT_M, Plan, box_corners, check_margins, rectangle_corners
 from sim.worlds.furnished import FurnishedOptions
 from sim.worlds.grid_file import read_grid
+from sim.worlds.grid_tour import plan_tour
 from sim.worlds.town import lawn, terrace, town
 from sim.worlds.world import World, facing_second
 from sim.worlds.world_file import check_tour, read_world
@@ -39,7 +40,11 @@ def from_file(*, rng: np.random.Generator, path: str) -> World:
 
 
 def from_grid(
-    *, rng: np.random.Generator, path: str | None = None, waypoints: Sequence[list[float]] = ()
+    *,
+    rng: np.random.Generator,
+    path: str | None = None,
+    waypoints: Sequence[list[float]] = (),
+    stops: int = 0,
 ) -> World:
     """Draw a world from an occupancy grid: a wall along each border of its occupied cells.
 
@@ -49,11 +54,14 @@ def from_grid(
         The grid's YAML file; see `sim.worlds.grid_file`.
     waypoints
         [[x, y], ...] m: the tour. A grid has none of its own, so the route needs way-points if
-        these are fewer than two.
+        these are fewer than two and `stops` is 0.
+    stops
+        Places, drawn at random, of a tour that is planned if there are no way-points; 2 or more, or
+        0 for none.
     """
-    del rng
     path = required(path, "world.path must name a grid's .yaml, such as one `estima map` wrote")
-    walls = read_grid(path).walls()
+    grid = read_grid(path)
+    walls = grid.walls()
     require(
         len(walls) <= _MOST_GRID_WALLS,
         f"{path}: {len(walls)} walls, and {_MOST_GRID_WALLS} are the most; clean the grid, or "
@@ -63,6 +71,9 @@ def from_grid(
         tour = np.array(waypoints, float).reshape(-1, 2)
     except (TypeError, ValueError):
         raise InputError(f"world.waypoints must be points [x, y], m, got {waypoints!r}") from None
+    require(stops == 0 or stops >= 2, f"world.stops must be 0, or 2 or more, got {stops}")
+    if len(tour) == 0 and stops:
+        tour = plan_tour(grid, stops, rng)
     check_tour(tour, walls, Path(path))
     return World(
         name=Path(path).stem,

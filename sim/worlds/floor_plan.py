@@ -235,11 +235,11 @@ class Plan:
         places = {k: np.array(v, float) for k, v in self.places.items()}
         places = dict(sorted(places.items(), key=lambda item: _mean_area(item[1])))
         earlier, stuff = rng.spawn(2)  # which leaves the generator's own stream as it is
-        known = self._of_another_day(earlier, changed_share)
+        known_walls, known_wall_z_m = self._of_another_day(earlier, changed_share)
         materials = self._materials(stuff, glass_share, dark_share)
         return World(
-            name, walls, heights, landmarks, descriptors, alike, places, start, tour, *known,
-            materials,
+            name, walls, heights, landmarks, descriptors, alike, places, start, tour,
+            known_walls, known_wall_z_m, materials,
         )  # fmt: skip
 
     def _materials(self, rng: np.random.Generator, glass: float, dark: float) -> Ints | None:

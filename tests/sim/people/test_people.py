@@ -37,7 +37,7 @@ def drive(n, seed=0, *, physics="kinematic", rays="exact", metres=6.0, **people)
 
 @pytest.fixture(scope="module")
 def crowded():
-    return drive(6, metres=25.0)
+    return drive(6, metres=12.0)
 
 
 def test_nobody_walks_into_walls_or_the_robot(crowded):
