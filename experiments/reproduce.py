@@ -3,7 +3,6 @@
 import importlib
 import os
 import re
-import sys
 import tempfile
 import time
 from collections import Counter
@@ -20,10 +19,10 @@ from experiments.judging.claims_file import (
 )
 from experiments.judging.folders import code_folder, findings
 from experiments.judging.logs import why_missing
-from experiments.judging.results import Profile, Results
+from experiments.judging.results import Profile, Results, reproduce_command
 from experiments.judging.sentences import Conclusion, conclude
 from experiments.report.page import write_report
-from experiments.runs.console import progress
+from experiments.runs.console import progress, show, warn
 from experiments.runs.paths import results, short
 from experiments.viewing.style import save_figure
 from sim.errors import InputError
@@ -59,19 +58,19 @@ def reproduce(*, full: bool = False, only: str | None = None) -> None:
     for paper in _chosen(only):
         begun = time.monotonic()
         if paper in LOGS and (why := why_missing()):
-            print(f"{paper}: left out, {why}", file=sys.stderr)
+            warn(f"{paper}: left out, {why}")
             continue
         conclusions = reproduce_paper(paper, profile)
         for each in conclusions:
-            print(f"{each.id:<4} {each.verdict.label:<15} {first_sentence(each.sentence)}")
+            show(f"{each.id:<4} {each.verdict.label:<15} {first_sentence(each.sentence)}")
         counts = Counter(each.verdict for each in conclusions)
         ruled = ", ".join(
             f"{counts[verdict]} {verdict.label}" for verdict in Verdict if verdict in counts
         )
         lines.append(f"{paper}: {ruled or 'judges no claim'} ({time.monotonic() - begun:.0f} s)")
     page = write_report(place)
-    print("\n".join(["", *lines]))
-    print(f"{short(page)} has the figures and tables behind them; open it in a browser")
+    show("\n".join(["", *lines]))
+    show(f"{short(page)} has the figures and tables behind them; open it in a browser")
 
 
 def redraw(only: str | None = None) -> None:
@@ -85,22 +84,22 @@ def redraw(only: str | None = None) -> None:
     place = results()
     present = [p for p in _chosen(only) if any((place / "tables").glob(f"{p}_*.csv"))]
     if not present:
-        command = f"estima reproduce --full{f' --paper {only}' if only else ''}"
         raise InputError(
-            f"{short(place / 'tables')}: no tables of {only or 'any paper'}; run `{command}`"
+            f"{short(place / 'tables')}: no tables of {only or 'any paper'}; "
+            f"run `{reproduce_command(only, full=True)}`"
         )
     for paper in _chosen(only):
         begun = time.monotonic()
         if paper not in present:
-            print(f"{paper}: left out, no tables in {short(place)}", file=sys.stderr)
+            warn(f"{paper}: left out, no tables in {short(place)}")
             continue
         made = Results(place, paper)
         if paper in LOGS and only is None and not any((place / "arrays").glob(f"{paper}_*.npz")):
-            print(f"{paper}: left out, what it draws of the logs is not here", file=sys.stderr)
+            warn(f"{paper}: left out, what it draws of the logs is not here")
             continue
         with made.blaming_files():
             _draw(made)
-        print(f"{paper}: {time.monotonic() - begun:.0f} s", file=sys.stderr)
+        warn(f"{paper}: {time.monotonic() - begun:.0f} s")
 
 
 def reproduce_paper(paper: str, profile: Profile) -> list[Conclusion]:
@@ -138,7 +137,7 @@ def judgement(made: Results) -> tuple[list[Claim], list[Conclusion]]:
 def _write(
     claims: list[Claim], conclusions: list[Conclusion], place: Path, paper: str, profile: Profile
 ) -> None:
-    command = f"estima reproduce --paper {paper}{' --full' * (profile is Profile.FULL)}"
+    command = reproduce_command(paper, full=profile is Profile.FULL)
     write_claims(claims, place / "claims.csv", paper=paper, profile=profile, command=command)
     says = findings(paper)["claims"]
     write_verdicts(conclusions, place / "verdicts.csv", paper=paper, says=says, profile=profile)
@@ -169,7 +168,7 @@ def _put_in_place(new: Path, old: Path, paper: str) -> None:
 def _chosen(only: str | None) -> tuple[str, ...]:
     known = (*PAPERS, *LOGS, *NAMED, *OWN)
     if only is not None and only not in known:
-        raise InputError(f"--paper must be one of {', '.join(known)}, got {only!r}")
+        raise InputError(f"the paper must be one of {', '.join(known)}, got {only!r}")
     return (*PAPERS, *LOGS) if only is None else (only,)
 
 

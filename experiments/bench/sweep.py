@@ -56,7 +56,7 @@ def _overheads() -> Iterator[Measurement]:
     )
 
     def packed_s(repeats: int) -> float:
-        many = experiment.replace(repeats=repeats)
+        many = experiment.with_values(repeats=repeats)
         return _packed_s([many], {many.recording_key: read})
 
     def swept_s(n_runs: int) -> float:
@@ -79,7 +79,7 @@ def _cheapest_run_ms() -> float:
     """Processor time of a run of the cheapest kind in a job, recording included."""
     short = Experiment.compose([*_SHORT, *_CHEAP, f"name={_NAME}", "picture=false"])
     first = time.time_ns() % 10**9  # seeds that the cache does not have
-    runs = [short.replace(seed=seed, world_seed=seed) for seed in range(first, first + 300)]
+    runs = [short.with_values(seed=seed, world_seed=seed) for seed in range(first, first + 300)]
     _packed_s(runs[:20], {})
     return 1e3 * _packed_s(runs[20:], {}) / len(runs[20:])
 

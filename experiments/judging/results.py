@@ -120,8 +120,13 @@ class Results:
 
     @property
     def _remedy(self) -> str:
-        full = "" if self.folder.name == "quick" else "--full "
-        return f"run `estima reproduce {full}--paper {self.paper}`"
+        return f"run `{reproduce_command(self.paper, full=self.folder.name != 'quick')}`"
+
+
+def reproduce_command(paper: str | None, *, full: bool) -> str:
+    """The command that makes a paper's results, or those of all papers."""
+    of_paper = f" --paper {paper}" if paper else ""
+    return f"estima reproduce{of_paper}{' --full' * full}"
 
 
 class _Arrays(Arrays):

@@ -7,7 +7,6 @@ import base64
 import hashlib
 import math
 import re
-import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ from markupsafe import Markup, escape
 from experiments.judging.results import Profile
 from experiments.report.contents import contents
 from experiments.report.export import plain, significant
+from experiments.runs.console import warn
 from sim.errors import printable
 from sim.files import write_text
 
@@ -36,10 +36,9 @@ def write_report(results: Path, on_progress: Callable[[float], None] = lambda _:
     """
     found = contents(results, on_progress)
     if found["missing"]:
-        print(
+        warn(
             f"{results / 'claims.csv'}: no verdict on {', '.join(found['missing'])}, though others "
-            "of the paper have one; `git checkout results/claims.csv` or `estima reproduce`",
-            file=sys.stderr,
+            "of the paper have one; `git checkout results/claims.csv` or `estima reproduce`"
         )
     path = results / "report.html"
     write_text(path, render("page.html", **found))

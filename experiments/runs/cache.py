@@ -5,7 +5,6 @@ It holds at most $ESTIMA_CACHE_GIB (8 unless set); the least recently used go fi
 
 import dataclasses
 import os
-import sys
 import time
 import zlib
 from collections.abc import Callable
@@ -13,6 +12,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from experiments.runs import paths
+from experiments.runs.console import warn
 from experiments.runs.processes import hold_lock
 from sim.errors import InputError, require
 from sim.files import require_file
@@ -45,7 +45,7 @@ def fetch_or_make(key: str, make: Callable[[], Recording]) -> Recording:
                 os.utime(path)
                 return recording
             except InputError as error:
-                print(f"estima: {error}; making it again", file=sys.stderr)
+                warn(f"estima: {error}; making it again")
                 path.unlink(missing_ok=True)
         recording = make()
         entry = dataclasses.replace(recording, config={**recording.config, _KEY: key})

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from experiments.runs.row import Row
 from experiments.runs.schema import SIMULATED_KEYS, Config, Leaf, leaves
-from experiments.runs.targets import list_targets
 from experiments.runs.version import SIMULATION, code_version, source_digest, version_with
 from sim.errors import InputError
 from sim.worlds import grid_file
@@ -123,6 +123,39 @@ def effective_config(config: Config) -> Config:
 def version_of(config: Config) -> str:
     """The code's version, and a digest of what the settings name from elsewhere."""
     return version_with(list_targets(effective_config(config)), config["estimator"].get("command"))
+
+
+def origin_columns(config: Config, choices: Mapping[str, str], checksum: str) -> Row:
+    """Columns that state a row's origin: choices, keys, versions, the recording's checksum.
+
+    Settings that did not make the recording have no column.
+    """
+    stated = effective_config(config)
+    brought = () if config["recording"] is None else ("world", "sensors", "route")
+    shown = {key: value for key, value in stated.items() if key not in ("keep", "picture")}
+    return {
+        **{f"choice.{g}": n for g, n in choices.items() if g in stated and g not in brought},
+        **{".".join(map(str, at)): _cell(value) for at, value in leaves(shown) if value != {}},
+        "repeat": 0,
+        "run_key": run_key(config),
+        "code_version": version_of(config),
+        "recording_checksum": checksum,
+    }
+
+
+def _cell(value: Any) -> Any:
+    """A value as a table's column holds it; a list becomes its text."""
+    if isinstance(value, int) and not -(2**63) <= value < 2**63:
+        return str(value)
+    return json.dumps(value) if isinstance(value, (list, tuple)) else value
+
+
+def list_targets(tree: Any) -> set[str]:
+    """Every `_target_` of a configuration."""
+    if not isinstance(tree, Mapping):
+        return set()
+    here = {tree["_target_"]} if isinstance(tree.get("_target_"), str) else set()
+    return here.union(*(list_targets(value) for value in tree.values()))
 
 
 def _recording_sources(config: Config) -> Config:

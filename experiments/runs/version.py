@@ -27,7 +27,7 @@ RUNS = (
         f"experiments/runs/{name}.py"
         for name in (
             *("compose", "evaluate", "experiment", "key", "objects"),
-            *("schema", "seeds", "targets", "team"),
+            *("schema", "seeds", "targets"),
         )
     ),
 )

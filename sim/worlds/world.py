@@ -105,8 +105,8 @@ class World:
         require(
             np.ndim(self.descriptors) == 2
             and np.shape(self.look_alike) in ((0,), (len(self.landmarks),)),
-            f"world {self.name}: descriptors must have shape (L, D), and look_alike (L,), of its "
-            f"{len(self.landmarks)} landmarks",
+            f"world {self.name}: its L = {len(self.landmarks)} landmarks need descriptors of shape "
+            "(L, D) and look_alike of shape (L,)",
         )
         if self.materials is not None:
             require(

@@ -59,7 +59,7 @@ def run(profile: Profile, out: Results, on_progress: Progress) -> None:
     """
 
     def drawn_from(run: TableRun) -> tuple[Scene, str]:
-        return Scene.of(run[1].config), json.dumps(run[1].options_of("route"))
+        return Scene.of(run[1]), json.dumps(run[1].options_of("route"))
 
     jobs = [
         [part[low : low + _RUNS_PER_JOB]]
@@ -82,13 +82,13 @@ def plan(profile: Profile) -> Iterator[TableRun]:
         ):
             drawn = one.options_of("recording")
             if drawn["draw"] < n_draws and drawn["image_draw"] <= n_repeats:
-                yield table, one.replace(repeats=min(one.repeats, n_repeats))
+                yield table, one.with_values(repeats=min(one.repeats, n_repeats))
 
 
 def rows_of(runs: Sequence[TableRun]) -> Tables:
     """Rows of every run over one recording, by table."""
     first = runs[0][1]
-    scene, recording = Scene.of(first.config), whole(first.config)
+    scene, recording = Scene.of(first), whole(first)
     truth, robot = recording.truth_at(recording.frame_stamps), first.robot()
     prior = first.prior(recording)
     rng = stream(0, "odometry")
@@ -101,7 +101,7 @@ def rows_of(runs: Sequence[TableRun]) -> Tables:
     }
     rows: dict[str, list[Row]] = {}
     for table, experiment in runs:
-        seen = thin(recording, experiment.config)
+        seen = thin(recording, experiment)
         labels = labels_of(table, experiment)
         shown = common | labels | _shown(seen)
         for repeat in range(experiment.repeats):

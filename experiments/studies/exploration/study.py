@@ -78,7 +78,7 @@ def compose_experiment(seed: int, strategy: str) -> Experiment:
 
 
 def coverage(team: Team, resolution_m: float) -> tuple[Array, Array]:
-    """Mean distance (T,) m driven a robot, and floor (T,) m^2 that the team has seen by then.
+    """Mean distance driven per robot (T,) m, and floor area seen by then (T,) m^2.
 
     Floor is what can be reached from the start, and seen what a beam has crossed, by the truth.
     """

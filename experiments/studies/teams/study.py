@@ -135,7 +135,7 @@ def _calibrated(recording: Recording) -> Recording:
     """
     found = calibrate_by_truth(recording)
     eyes = dict.fromkeys(("stereo", "robots"), found.sensors["stereo"])
-    own = dataclasses.replace(found, sensors=eyes).apply(recording)
+    own = dataclasses.replace(found, sensors=eyes).apply_to(recording)
     for name in eyes:
         camera: Any = own.sensors[name]
         log = own.log(name)

@@ -35,7 +35,7 @@ def test_a_million_runs_are_planned_as_each_of_them_alone():
             [f"seed={i // 1000}", f"robot.kr={c['robot']['kr']}", "robot.kl=${robot.kr}",
              "simulation.physics=kinematic"]
         )  # fmt: skip
-        assert c == alone.replace(picture=False).config
+        assert c == alone.with_values(picture=False).config
         assert int(alone.key, 16) == every.keys[i]
 
 
@@ -92,8 +92,8 @@ def test_unknown_keys_and_options_are_refused():
 
 def test_keys_depend_on_what_decides_the_rows(tmp_path, monkeypatch):
     experiment = Experiment.compose([])
-    assert experiment.replace(name="other").key == experiment.key
-    assert experiment.replace(seed=5).key != experiment.key
+    assert experiment.with_values(name="other").key == experiment.key
+    assert experiment.with_values(seed=5).key != experiment.key
     monkeypatch.syspath_prepend(str(tmp_path))
     (tmp_path / "package").mkdir()
     for target, source, beside in (
@@ -101,7 +101,7 @@ def test_keys_depend_on_what_decides_the_rows(tmp_path, monkeypatch):
         ("package.part.Mine", "package/part.py", "package/other.py"),  # without an __init__
     ):
         (tmp_path / source).write_text("import helper_of_mine\nclass Mine: pass\n")
-        own = experiment.replace(estimator={"_target_": target})
+        own = experiment.with_values(estimator={"_target_": target})
         keys = [own.key]
         for file in (source, beside):
             (tmp_path / file).write_text("import helper_of_mine\nclass Mine: x = 1\n")
@@ -109,7 +109,7 @@ def test_keys_depend_on_what_decides_the_rows(tmp_path, monkeypatch):
             keys.append(own.key)
         assert len(set(keys)) == 3, target
     with pytest.raises(InputError, match=r"nowhere\.npz"):
-        _ = experiment.replace(recording="nowhere.npz").recording_key
+        _ = experiment.with_values(recording="nowhere.npz").recording_key
 
 
 def test_keys_know_the_files_that_a_mapping_names(tmp_path):
@@ -121,9 +121,9 @@ def test_keys_know_the_files_that_a_mapping_names(tmp_path):
     experiment = Experiment.compose([])
     prior = experiment.config["prior"]
     for changed in (
-        experiment.replace(recording=named),
-        experiment.replace(prior={**prior, "map": named}),
-        experiment.replace(prior={**prior, "map": {"_target_": "x", "f": str(tmp_path)}}),
+        experiment.with_values(recording=named),
+        experiment.with_values(prior={**prior, "map": named}),
+        experiment.with_values(prior={**prior, "map": {"_target_": "x", "f": str(tmp_path)}}),
     ):
         (tmp_path / "a.npy").write_bytes(b"1")
         before = changed.key
@@ -141,7 +141,7 @@ def test_keys_know_the_files_that_an_estimators_options_name(tmp_path, monkeypat
     assert (plain.key, plain.recording_key) == before_files
     feedback = {"_target_": "estimators.odometry.Odometry", "tables": ["none", "a.npz"]}
     named = plain.with_estimator(map_path="a.npz")
-    steered = plain.replace(route={**plain.config["route"], "feedback": feedback})
+    steered = plain.with_values(route={**plain.config["route"], "feedback": feedback})
     swept = ["estimator=topological_mcl", "estimator.map_path=a.npz,b.npz"]
     old = named.key, steered.key, steered.recording_key, plan.make_plan(swept).keys[0]
     (tmp_path / "a.npz").write_bytes(b"2")
@@ -199,9 +199,9 @@ def test_wrong_sweeps_end_in_one_line(arguments, words):
 def test_the_last_value_of_a_key_decides_a_sweeps_own_name():
     made = plan.make_plan(["seed=0,1"])
     orders = (["robot.kr=1e-5", "robot.kr=1e-4"], ["robot.kr=1e-4", "robot.kr=1e-5"])
-    forward, back = (launch._name(made, ["seed=0,1", *order], None) for order in orders)
+    forward, back = (made.name_by(["seed=0,1", *order], None) for order in orders)
     assert forward != back
-    assert forward == launch._name(made, ["robot.kr=1e-4", "seed=0,1"], None)
+    assert forward == made.name_by(["robot.kr=1e-4", "seed=0,1"], None)
 
 
 @pytest.mark.parametrize(
@@ -209,7 +209,7 @@ def test_the_last_value_of_a_key_decides_a_sweeps_own_name():
     [
         (["-m", "hydra/sweeper=optuna"], ["hydra/sweeper", "every combination"]),
         (["-m", "hydra.sweep.dir=/tmp/x"], ["hydra.sweep.dir", "set name"]),
-        (["hydra.run.dir=/tmp/x"], ["hydra.run.dir", "--results"]),
+        (["hydra.run.dir=/tmp/x"], ["hydra.run.dir", "ESTIMA_RESULTS"]),
         (["hydra.verbose=true"], ["hydra.verbose", "nothing is logged"]),
         (["-m", "robot.kr=interval(0,1)"], ["interval(0,1)", "range(0,1,0.1)"]),
         (["-m", "route=glob(nothing*)"], ["empty range or list"]),
