@@ -186,8 +186,9 @@ def _places(cfg: DictConfig, groups: Iterable[str]) -> Iterator[str]:
 
 def _target(settings: DictConfig, place: str) -> Callable[..., Any]:
     """What takes the settings of a place."""
-    for place in _places(cfg, (*GROUPS, "people")):
-        settings = value_at(cfg, place)
+    if place in _UNNAMED and "_target_" not in settings:
+        return _UNNAMED[place]
+    return find(value_at(settings, "_target_"), place)
 
 
 def _filled(target: Callable[..., Any], given: Mapping[str, Any]) -> Config:
