@@ -264,6 +264,7 @@ def office(
     objects_per_room: int = 5,
     rooms_visited: int = 8,
     changed_share: float = 0.0,
+    doors_share: float = 0.0,
 ) -> World:
     """Build an office floor of 66 x 42 m: 22 furnished rooms on two corridor loops.
 
@@ -318,6 +319,7 @@ def office(
         n_landmarks=n_landmarks,
         look_alike_share=look_alike_share,
         changed_share=changed_share,
+        doors_share=doors_share,
     )
 
 

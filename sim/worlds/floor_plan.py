@@ -41,6 +41,8 @@ class Plan:
     approaches
         x1, y1, x2, y2 of stretches that furniture keeps clear besides the tour: the ways
         through the doors.
+    doorways
+        x1, y1, x2, y2 of the gaps in walls.
     """
 
     faces: list[tuple[float, ...]] = field(default_factory=list)
@@ -53,6 +55,7 @@ class Plan:
     places: dict[str, list[tuple[float, float, float, float]]] = field(default_factory=dict)
     tour: list[tuple[float, float]] = field(default_factory=list)
     approaches: list[tuple[float, ...]] = field(default_factory=list)
+    doorways: list[tuple[float, ...]] = field(default_factory=list)
 
     def wall(
         self,
@@ -71,6 +74,9 @@ class Plan:
             if low - begin > 1e-6:
                 a, b = np.asarray(start) + begin * unit, np.asarray(start) + low * unit
                 self._face((a[0], a[1], b[0], b[1]), (0.0, top_m), on_object=False)
+            if high > low:
+                a, b = np.asarray(start) + low * unit, np.asarray(start) + high * unit
+                self.doorways.append((*a.tolist(), *b.tolist()))
             begin = max(begin, high)
 
     def enclosure(self, corners: ArrayLike) -> None:
@@ -218,12 +224,13 @@ class Plan:
         changed_share: float = 0.0,
         glass_share: float = 0.0,
         dark_share: float = 0.0,
+        doors_share: float = 0.0,
     ) -> World:
         """Finish the world, with landmarks scattered over its faces.
 
         `changed_share` of its objects stand elsewhere on the map that estimators get, or are on it
         or in the world alone. Of the walls, by stretches of 2 m or whole faces, some are of glass
-        and some dark.
+        and some dark. Of the doorways, some have a door.
         """
         walls = np.array(self.faces, float).reshape(-1, 4)
         heights = np.array(self.heights, float).reshape(-1, 2)
@@ -234,12 +241,16 @@ class Plan:
         # The smallest first, so that a door is not taken for the room it leads to.
         places = {k: np.array(v, float) for k, v in self.places.items()}
         places = dict(sorted(places.items(), key=lambda item: _mean_area(item[1])))
-        earlier, stuff = rng.spawn(2)  # which leaves the generator's own stream as it is
+        earlier, stuff, leaves = rng.spawn(3)  # which leaves the generator's own stream as it is
         known_walls, known_wall_z_m = self._of_another_day(earlier, changed_share)
         materials = self._materials(stuff, glass_share, dark_share)
+        doors = None
+        if doors_share > 0.0:
+            doorways = np.array(self.doorways, float).reshape(-1, 4)
+            doors = doorways[leaves.random(len(doorways)) < doors_share]
         return World(
             name, walls, heights, landmarks, descriptors, alike, places, start, tour,
-            known_walls, known_wall_z_m, materials,
+            known_walls, known_wall_z_m, materials, doors,
         )  # fmt: skip
 
     def _materials(self, rng: np.random.Generator, glass: float, dark: float) -> Ints | None:

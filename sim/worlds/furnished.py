@@ -23,6 +23,9 @@ class FurnishedOptions:
     dark_share: Share = 0.0
     """Share of the walls that are black, to lasers with a `reach_at_10_percent_m`."""
 
+    doors_share: Share = 0.0
+    """Share of the doorways that have a door, which opens and closes, and is not on the map."""
+
     def finish(
         self, plan: Plan, name: str, rng: np.random.Generator, on_walls_share: float = 0.7
     ) -> World:
@@ -36,4 +39,5 @@ class FurnishedOptions:
             changed_share=self.changed_share,
             glass_share=self.glass_share,
             dark_share=self.dark_share,
+            doors_share=self.doors_share,
         )

@@ -64,6 +64,8 @@ class World:
         nothing has changed since. Landmarks are as they are driven past.
     materials
         (W,) `Material` of each face; None where all are plaster.
+    doors
+        (D, 4) m: feet of doors that open and close, as they are when closed; None without any.
     """
 
     name: str
@@ -78,6 +80,7 @@ class World:
     known_walls: Array | None = None
     known_wall_z_m: Array | None = None
     materials: Ints | None = None
+    doors: Array | None = None
 
     def __post_init__(self) -> None:
         shapes = {
@@ -88,6 +91,8 @@ class World:
             "waypoints": (self.waypoints, (len(self.waypoints), 2)),
             **{f"places.{k}": (v, (len(v), 4)) for k, v in self.places.items()},
         }
+        if self.doors is not None:
+            shapes["doors"] = self.doors, (len(self.doors), 4)
         if self.known_walls is not None and self.known_wall_z_m is not None:
             shapes["known_walls"] = self.known_walls, (len(self.known_walls), 4)
             shapes["known_wall_z_m"] = self.known_wall_z_m, (len(self.known_walls), 2)
