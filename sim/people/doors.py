@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sim.arrays import Array
+from sim.arrays import Array, Bools
 from sim.robot.base import TICK_S
 from sim.routes.feedback import CONTROL_TICKS
 
@@ -49,7 +49,7 @@ class Doors:
         ends = leaves[:, 2:] + share * (leaves[:, :2] - leaves[:, 2:])
         return np.hstack([leaves[:, :2], ends]), np.tile([0.0, DOOR_M], (len(leaves), 1))
 
-    def _near(self, others: Array) -> Array:
+    def _near(self, others: Array) -> Bools:
         """Whether somebody is near each door (D,)."""
         middles = (self._leaves[:, :2] + self._leaves[:, 2:]) / 2.0
         gaps = np.hypot(*(middles[:, None] - others[None, :, :2]).transpose(2, 0, 1))

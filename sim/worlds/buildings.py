@@ -21,6 +21,7 @@ from sim.worlds.furnished import FurnishedOptions
 from sim.worlds.grid_file import read_grid
 from sim.worlds.grid_tour import plan_tour
 from sim.worlds.town import lawn, terrace, town
+from sim.worlds.vary import Shares, vary
 from sim.worlds.world import World, facing_second
 from sim.worlds.world_file import check_tour, read_world
 
@@ -102,13 +103,8 @@ def room(
     a, b = 1.2, (length_m - 1.2, width_m - 1.2)
     plan.tour = [(a, a), (b[0], a), (b[0], b[1]), (a, b[1]), (a, a)]
     plan.furnish(rng, (0, 0), (length_m, width_m), n_objects, size_m=(0.3, 1.0), clearance_m=0.45)
-    return plan.world(
-        "room",
-        rng,
-        n_landmarks=n_landmarks,
-        look_alike_share=look_alike_share,
-        changed_share=changed_share,
-    )
+    world = plan.world("room", rng, n_landmarks=n_landmarks, look_alike_share=look_alike_share)
+    return vary(plan, world, rng, Shares(changed_share))
 
 
 def boxes(
@@ -127,13 +123,8 @@ def boxes(
     a, b = 1.2, side_m - 1.2
     plan.tour = [(a, a), (b, a), (b, b), (a, b), (a, a)]
     plan.furnish(rng, (0, 0), (side_m, side_m), n_boxes, clearance_m=0.5)
-    return plan.world(
-        "boxes",
-        rng,
-        n_landmarks=n_landmarks,
-        look_alike_share=look_alike_share,
-        changed_share=changed_share,
-    )
+    world = plan.world("boxes", rng, n_landmarks=n_landmarks, look_alike_share=look_alike_share)
+    return vary(plan, world, rng, Shares(changed_share))
 
 
 @options("world")
@@ -313,14 +304,8 @@ def office(
         _line_up(plan, rng, low, high, 7, keep_off=doors)
     for room in rooms:
         plan.furnish(rng, room.low, room.high, objects_per_room, size_m=(0.4, 1.6))
-    return plan.world(
-        "office",
-        rng,
-        n_landmarks=n_landmarks,
-        look_alike_share=look_alike_share,
-        changed_share=changed_share,
-        doors_share=doors_share,
-    )
+    world = plan.world("office", rng, n_landmarks=n_landmarks, look_alike_share=look_alike_share)
+    return vary(plan, world, rng, Shares(changed_share, doors=doors_share))
 
 
 def streets(

@@ -6,17 +6,14 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from sim.arrays import Array, ArrayLike, Bools, Floats, Ints
+from sim.arrays import Array, ArrayLike, Bools, Floats
 from sim.errors import InputError, require
-from sim.se2 import transform
-from sim.worlds.world import Material, World, facing_second
+from sim.worlds.world import World, facing_second
 
 WALL_HEIGHT_M = 2.5
 DESCRIPTOR_SIZE = 128
 CHORD_ERROR_M = 1e-4  # between a polygon and what is round
 _APART_M = 0.12  # between furniture and walls, and among furniture
-_MOVES_TRIED = 50
-_STRETCH_M = 2.0  # of a wall of one material, at least
 _PROUD_M = 0.01  # landmarks stand this far off their face, so that rays see them from its side
 
 
@@ -221,17 +218,8 @@ class Plan:
         n_landmarks: int = 0,
         on_walls_share: float = 0.7,
         look_alike_share: float = 0.0,
-        changed_share: float = 0.0,
-        glass_share: float = 0.0,
-        dark_share: float = 0.0,
-        doors_share: float = 0.0,
     ) -> World:
-        """Finish the world, with landmarks scattered over its faces.
-
-        `changed_share` of its objects stand elsewhere on the map that estimators get, or are on it
-        or in the world alone. Of the walls, by stretches of 2 m or whole faces, some are of glass
-        and some dark. Of the doorways, some have a door.
-        """
+        """Finish the world, with landmarks scattered over its faces."""
         walls = np.array(self.faces, float).reshape(-1, 4)
         heights = np.array(self.heights, float).reshape(-1, 2)
         landmarks = self._landmarks(rng, n_landmarks, on_walls_share)
@@ -241,58 +229,7 @@ class Plan:
         # The smallest first, so that a door is not taken for the room it leads to.
         places = {k: np.array(v, float) for k, v in self.places.items()}
         places = dict(sorted(places.items(), key=lambda item: _mean_area(item[1])))
-        earlier, stuff, leaves = rng.spawn(3)  # which leaves the generator's own stream as it is
-        known_walls, known_wall_z_m = self._of_another_day(earlier, changed_share)
-        materials = self._materials(stuff, glass_share, dark_share)
-        doors = None
-        if doors_share > 0.0:
-            doorways = np.array(self.doorways, float).reshape(-1, 4)
-            doors = doorways[leaves.random(len(doorways)) < doors_share]
-        return World(
-            name, walls, heights, landmarks, descriptors, alike, places, start, tour,
-            known_walls, known_wall_z_m, materials, doors,
-        )  # fmt: skip
-
-    def _materials(self, rng: np.random.Generator, glass: float, dark: float) -> Ints | None:
-        """Material (W,) of each face; None if all are plaster."""
-        require(
-            0.0 <= glass <= 1.0 and 0.0 <= dark <= 1.0 and glass + dark <= 1.0,
-            f"world.glass_share and dark_share must be shares of one whole, got {glass}, {dark}",
-        )
-        if glass + dark == 0.0:
-            return None
-        faces = np.array(self.faces)
-        along_m = np.cumsum(np.hypot(*(faces[:, 2:] - faces[:, :2]).T))
-        stretch = (along_m / _STRETCH_M).astype(np.int64)
-        drawn = rng.random(stretch[-1] + 1)[stretch]
-        kinds = np.select([drawn < glass, drawn < glass + dark], [Material.GLASS, Material.DARK], 0)
-        return np.where(self.on_object, Material.PLASTER, kinds).astype(np.int64)
-
-    def _of_another_day(
-        self, rng: np.random.Generator, share: float
-    ) -> tuple[Array, Array] | tuple[None, None]:
-        """Faces (K, 4) and heights (K, 2) with a share of the objects changed.
-
-        A third of them each are somewhere else in the same room, are missing, and have another like
-        them near by.
-        """
-        require(0.0 <= share <= 1.0, f"world.changed_share must lie in [0, 1], got {share}")
-        if share == 0.0 or not self.objects:
-            return None, None
-        faces, heights = np.array(self.faces), np.array(self.heights)
-        fixed = faces[~np.array(self.on_object)]
-        kept = np.ones(len(faces), bool)
-        added: list[tuple[Array, Array]] = []
-        changed = rng.permutation(len(self.objects))[: round(share * len(self.objects))]
-        for number, which in enumerate(changed):
-            rows = slice(*self.objects[which])
-            kept[rows] = number % 3 == 2  # of these another one is added
-            if number % 3 != 1:
-                added.append((_moved_near(faces[rows], fixed, rng), heights[rows]))
-        return (
-            np.concatenate([faces[kept], *(moved for moved, _ in added)]),
-            np.concatenate([heights[kept], *(own for _, own in added)]),
-        )
+        return World(name, walls, heights, landmarks, descriptors, alike, places, start, tour)
 
     def _face(self, ends: Sequence[float], height: tuple[float, float], *, on_object: bool) -> None:
         self.faces.append(tuple(map(float, ends)))
@@ -374,20 +311,6 @@ class Plan:
         for ring, top in self.solids:
             free &= ~(inside(points[:, :2], ring) & (points[:, 2] < top))
         return free
-
-
-def _moved_near(faces: Array, walls: Array, rng: np.random.Generator) -> Array:
-    """Faces (N, 4) of an object, turned and moved by up to 1.5 m within the room with walls."""
-    ends = faces.reshape(-1, 2)
-    centre = ends.mean(axis=0)
-    for _ in range(_MOVES_TRIED):
-        angle, way = rng.uniform(-math.pi, math.pi, 2)
-        shift = rng.uniform(0.4, 1.5) * np.array([math.cos(way), math.sin(way)])
-        moved = transform([*(centre + shift), angle], ends - centre).reshape(-1, 4)
-        through = np.concatenate([centre, centre + shift])[None]
-        if not len(walls) or gaps_m(np.vstack([moved, through]), walls).min() > 0.02:
-            return moved
-    return faces
 
 
 def rectangle_corners(low: Sequence[float] | Array, high: Sequence[float] | Array) -> Array:

@@ -5,6 +5,7 @@ from pydantic import NonNegativeInt
 
 from sim.options import Share, options
 from sim.worlds.floor_plan import Plan
+from sim.worlds.vary import Shares, vary
 from sim.worlds.world import World
 
 
@@ -30,14 +31,12 @@ class FurnishedOptions:
         self, plan: Plan, name: str, rng: np.random.Generator, on_walls_share: float = 0.7
     ) -> World:
         """Finish a plan by these options."""
-        return plan.world(
+        world = plan.world(
             name,
             rng,
             n_landmarks=self.n_landmarks,
             on_walls_share=on_walls_share,
             look_alike_share=self.look_alike_share,
-            changed_share=self.changed_share,
-            glass_share=self.glass_share,
-            dark_share=self.dark_share,
-            doors_share=self.doors_share,
         )
+        shares = self.changed_share, self.glass_share, self.dark_share, self.doors_share
+        return vary(plan, world, rng, Shares(*shares))
