@@ -18,6 +18,7 @@ import numpy as np
 from sim import se2
 from sim.arrays import Array, Values
 from sim.errors import require
+from sim.people.doors import Doors
 from sim.people.giving_way import GivingWay
 from sim.people.walk import Crowd, People
 from sim.recording import CommandLog, Log, Recording, Truth, WheelLog, log_of_readings
@@ -27,7 +28,7 @@ from sim.robot.kinematic import KinematicBody
 from sim.routes.feedback import Feedback, Onboard, feedback_of
 from sim.sensors.base import Rays, Reading, Sensor, Sensors, View, split_schema
 from sim.sensors.firing import Firing, periods, probes
-from sim.sensors.rays import AmongPeople, AmongRobots, BulletRays, ExactRays
+from sim.sensors.rays import AmongFaces, AmongPeople, BulletRays, ExactRays, robot_faces
 from sim.team import Team
 from sim.worlds.world import World
 
@@ -157,6 +158,10 @@ def record_team(
     require(
         rays != "bullet" or physics == "bullet", "rays=bullet needs physics=bullet; set rays=exact"
     )
+    require(
+        rays != "bullet" or world.materials is None,
+        f"world {world.name} has walls of glass or dark ones; set rays=exact",
+    )
     for member in members:
         periods(member.sensors)  # checks them before anything is built
     starts = [member.route.start(world, member.robot) for member in members]
@@ -170,6 +175,10 @@ def record_team(
             values.setflags(write=False)
     now = dict(enumerate(pose for pose, _ in starts))  # poses at the tick
     crowd = _crowd_of(world, members, [pose for pose, _ in starts], passers_by)
+    doors = None
+    if passers_by is not None and world.doors is not None:
+        (own,) = passers_by[1].spawn(1)
+        doors = Doors(world.doors, np.array([pose for pose, _ in starts]), own)
     statuses: dict[int, str] = {}
     drives: dict[int, _Drive] = {}
     with contextlib.ExitStack() as stack:
@@ -181,7 +190,9 @@ def record_team(
             body, find_trouble, caster = _bodied(world, member.robot, start, physics, rays, stack)
             others = _others(now, number)
             if len(members) > 1:
-                caster = AmongRobots(caster, _bodies_of(members, others))
+                caster = AmongFaces(caster, _bodies_of(members, others))
+            if doors is not None:
+                caster = AmongFaces(caster, doors.faces)
             if crowd is not None:
                 caster = AmongPeople(caster, crowd)
                 driver = GivingWay(driver, crowd, number, member.robot, _pose_of(body))
@@ -192,8 +203,8 @@ def record_team(
         for tick in itertools.count():
             if len(members) > 1:
                 now.update(enumerate(drive.body.pose for drive in drives.values()))
-            if crowd is not None:
-                crowd.advance(tick, [drive.body.pose for drive in drives.values()])
+            if crowd is not None or doors is not None:
+                _let_move(crowd, doors, tick, [drive.body.pose for drive in drives.values()])
             for number, drive in [*underway.items()]:
                 try:
                     next(drive)
@@ -240,6 +251,15 @@ def _crowd_of(
     return Crowd(passers_by[0], world, [member.robot for member in members], poses, passers_by[1])
 
 
+def _let_move(crowd: Crowd | None, doors: Doors | None, tick: int, poses: Sequence[Array]) -> None:
+    """Let people and doors move at a tick, with the robots at poses (3,)."""
+    if crowd is not None:
+        crowd.advance(tick, poses)
+    if doors is not None:
+        walking = np.zeros((0, 3)) if crowd is None else crowd.at(np.array(crowd.now_s))[:, :3]
+        doors.advance(tick, np.vstack([poses, walking]))
+
+
 def _pose_of(body: Body) -> Callable[[], Array]:
     """Function that gives a body's pose (3,) as it is now."""
     return lambda: body.pose
@@ -271,9 +291,9 @@ def _others(now: Mapping[int, Array], number: int) -> Callable[[], Mapping[int, 
 
 def _bodies_of(
     members: Sequence[Member], others: Callable[[], Mapping[int, Array]]
-) -> Callable[[], list[tuple[Robot, Array]]]:
-    """Function that gives the other robots and their poses at this tick."""
-    return lambda: [(members[other].robot, pose) for other, pose in others().items()]
+) -> Callable[[], tuple[Array, Array]]:
+    """Function that gives the faces of the other robots at this tick, and their heights."""
+    return lambda: robot_faces([(members[other].robot, pose) for other, pose in others().items()])
 
 
 class _Drive:

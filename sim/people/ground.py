@@ -57,14 +57,16 @@ class Ground:
         columns, rows = (np.ceil((high - low) / (cell_m * per_way)) * per_way).astype(int)
         within = world.wall_z_m[:, 0] < height_m
         occupied = mark_walls(world.walls[within], low, cell_m, (int(rows), int(columns)))
+        starts = np.concatenate([world.start_pose[None, :2], world.waypoints])
+        cells = np.floor((starts - low) / cell_m).astype(np.int64)[:, ::-1]
+        rooms, _ = ndimage.label(~occupied)
+        inside = np.isin(rooms, np.setdiff1d(rooms[cells[:, 0], cells[:, 1]], [0]))
         # A wall lies anywhere in its cell, and a person anywhere in the own one
-        clear_m = cell_m * (clearance(occupied) - math.sqrt(2.0))
+        clear_m = np.where(inside, cell_m * (clearance(occupied) - math.sqrt(2.0)), -1.0)
         coarse = clear_m.reshape(rows // per_way, per_way, columns // per_way, per_way)
         free = coarse.min(axis=(1, 3)) >= radius_m
         floors, _ = ndimage.label(free)
-        starts = np.concatenate([world.start_pose[None, :2], world.waypoints])
-        cells = np.floor((starts - low) / (cell_m * per_way)).astype(np.int64)[:, ::-1]
-        near = nearest(free, cells) if free.any() else cells
+        near = nearest(free, cells // per_way) if free.any() else cells // per_way
         walked = np.isin(floors, np.setdiff1d(floors[near[:, 0], near[:, 1]], [0]))
         require(
             bool(walked.any()), f"world {world.name} has no room for people to walk; set people.n=0"

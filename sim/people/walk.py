@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from pydantic import NonNegativeInt
 
-from sim.arrays import Array, Bools, Ints
+from sim.arrays import Array, Ints
 from sim.compiled import njit
 from sim.errors import require
 from sim.options import Positive, options
@@ -25,7 +25,7 @@ from sim.worlds.world import World
 STEP_S = CONTROL_TICKS * TICK_S  # between two decisions of a person
 _AHEAD = 2  # points along the way, of the one that is walked to
 _LOOK_S = 0.7  # how far ahead a step is judged
-_STUCK_STEPS = 75  # after which another place is sought
+_STUCK_STEPS, _STUCK_M = 75, 0.3  # in so many steps less far than that: another place is sought
 _KEPT_OFF_M, _KEPT_OFF_AT_REST_M = 0.1, 0.02  # from a robot, beyond what it needs to stop
 _AT_REST_MPS = 0.01
 _PRESSED_M = 0.2  # gap to a robot below which people squeeze past one another
@@ -122,7 +122,7 @@ class Crowd:
         walked = rng.uniform(0.0, people.stride_m, people.n)
         self._states = [np.column_stack([first, headings, walked])]  # (n, 4) at each decision
         self._way = [np.zeros((0, 2)) for _ in range(people.n)]
-        self._stuck = np.zeros(people.n, np.int64)
+        self._stuck, self._marked = np.zeros(people.n, bool), first
 
     def _starts(self, cells: Ints) -> Array:
         """First places (n, 2), clear of robots and of each other."""
@@ -157,12 +157,14 @@ class Crowd:
             [self._target(person, state[person, :2]) for person in range(len(state))]
         )
         ground = self._ground
-        moved = _walk(
+        if len(self._states) % _STUCK_STEPS == 0:
+            self._stuck = np.hypot(*(state[:, :2] - self._marked).T) < _STUCK_M
+            self._marked = state[:, :2].copy()
+        _walk(
             state, targets, self._speeds, obstacles,
             (ground.clear_m, ground.corner_m[0], ground.corner_m[1], ground.cell_m), radius_m,
             self.people.torso_radius_m,
         )  # fmt: skip
-        self._stuck = np.where(moved, np.maximum(self._stuck - 1, 0), self._stuck + 1)
         self._states.append(state)
 
     def _target(self, person: int, at: Array) -> Array:
@@ -171,13 +173,13 @@ class Crowd:
         if len(way):
             away_m = np.hypot(*(way[:20] - at).T)
             way = way[int(np.argmin(away_m)) :]
-        if len(way) == 0 or math.dist(at, way[-1]) < 0.2 or self._stuck[person] > _STUCK_STEPS:
+        if len(way) == 0 or math.dist(at, way[-1]) < 0.2 or self._stuck[person]:
             # for somebody in the way of a robot: of several places, one that lies behind the back
-            tries = 8 if self._stuck[person] > _STUCK_STEPS else 1
+            tries = 8 if self._stuck[person] else 1
             every = [self._ways(self._choose()) for _ in range(tries)]
             ways = every[0] if tries == 1 else max(every, key=lambda ways: self._lead(ways, at))
             way = self._ground.way(ways, at)
-            self._stuck[person] = 0
+            self._stuck[person] = False
         self._way[person] = way
         return _ahead(way) if len(way) else at
 
@@ -308,14 +310,13 @@ def _walk(
     field: tuple[Array, float, float, float],
     radius_m: float,
     torso_m: float,
-) -> Bools:
-    """Move each person (n, 4) one step, in place; whether it came nearer to its target.
+) -> None:
+    """Move each person (n, 4) one step, in place.
 
     Of steps in twelve directions, and none, the one that leads best to the target and to room. No
     step is taken into a wall, nor to a robot or person that is too near already; close to a robot
     people squeeze past one another.
     """
-    progress = np.zeros(len(states), np.bool_)
     for i in range(len(states)):
         x, y = states[i, 0], states[i, 1]
         gap, apart = _robot_gap(obstacles, x, y, radius_m), _person_gap(states, i, x, y, radius_m)
@@ -348,5 +349,3 @@ def _walk(
             states[i, 1] += step_m * math.sin(heading)
             states[i, 2] = heading
             states[i, 3] += step_m
-            progress[i] = math.cos(turn) > 0.5
-    return progress

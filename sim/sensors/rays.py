@@ -1,6 +1,6 @@
 """Rays in a world: by the exact caster, or by the physics engine; the geometry is the same."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,10 @@ class ExactRays:
     """The caster of `sim.sensors.casting`, imported only where it is used: it needs a compiler."""
 
     def __init__(self, world: World) -> None:
-        self._world = world
+        self._world, self._opaque = world, world
+        if world.materials is not None:
+            solid = world.materials != Material.GLASS
+            self._opaque = World(world.name, world.walls[solid], world.wall_z_m[solid])
         self._casters: dict[Any, Any] = {}
 
     def scan(self, scanner: Any, pose: Array) -> Array:
@@ -40,7 +43,7 @@ class ExactRays:
         """Whether nothing stands between a point (3,) and each of others (K, 3)."""
         from sim.sensors.casting import visible
 
-        return visible(self._world, origin, points)
+        return visible(self._opaque, origin, points)
 
     def hits(self, scanner: Any, eyes: Array, bearings_rad: Array, stamps: Array) -> Hits:
         """What beams (B,) hit, each with its own pose of the scanner (B, 3), bearing and time."""
@@ -49,25 +52,22 @@ class ExactRays:
         return cast_beams(self._world, scanner, eyes, bearings_rad)
 
 
-class AmongRobots:
-    """Rays in a world in which other robots stand, each a box of the size of its body.
+class AmongFaces:
+    """Rays in a world in which faces move: robots, each a box of its body's size, and doors.
 
     Parameters
     ----------
     rays
         Those of the world alone.
-    others
-        Gives the other robots and their poses (3,) as they are now.
+    faces
+        Gives the faces (K, 4), and their bottoms and tops (K, 2), m, as they are now.
     """
 
-    def __init__(self, rays: Rays, others: Callable[[], list[tuple[Robot, Array]]]) -> None:
-        self._rays, self._others = rays, others
+    def __init__(self, rays: Rays, faces: Callable[[], tuple[Array, Array]]) -> None:
+        self._rays, self._faces = rays, faces
 
     def _boxes(self) -> ExactRays:
-        others = self._others()
-        faces = np.concatenate([np.zeros((0, 4)), *(_faces(*other) for other in others)])
-        heights_m = np.repeat([robot.body_height_m for robot, _ in others], 4)
-        return ExactRays(World("robots", faces, np.stack([0.0 * heights_m, heights_m], axis=1)))
+        return ExactRays(World("moving", *self._faces()))
 
     def scan(self, scanner: Any, pose: Array) -> Array:
         """Ranges (beams,) m of a scanner on the robot at a pose (3,); inf without a return."""
@@ -87,7 +87,14 @@ class AmongRobots:
         return there.nearer(self._boxes().hits(scanner, eyes, bearings_rad, stamps))
 
 
-def _faces(robot: Robot, pose: Array) -> Array:
+def robot_faces(others: Sequence[tuple[Robot, Array]]) -> tuple[Array, Array]:
+    """Sides (4 n, 4) of the bodies of robots at poses (3,), and bottoms and tops (4 n, 2), m."""
+    faces = np.concatenate([np.zeros((0, 4)), *(_sides(*other) for other in others)])
+    heights_m = np.repeat([robot.body_height_m for robot, _ in others], 4)
+    return faces, np.stack([0.0 * heights_m, heights_m], axis=1)
+
+
+def _sides(robot: Robot, pose: Array) -> Array:
     """Sides (4, 4) of a robot's body, seen from above, m in map."""
     x, y = robot.body_length_m / 2, robot.body_width_m / 2
     corners = transform(pose, np.array([[x, y], [-x, y], [-x, -y], [x, -y]]))

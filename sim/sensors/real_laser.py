@@ -65,6 +65,7 @@ class RealLaser(Laser):
     null: +inf."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         nothing = self.nothing_m
         require(
             nothing is None or not self.min_range_m < nothing < self.max_range_m,

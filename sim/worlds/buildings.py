@@ -16,9 +16,19 @@ from pydantic import NonNegativeInt
 from sim.arrays import Array
 from sim.errors import InputError, require, required
 from sim.options import Count, NonNegative, Positive, Share, build, options
-from sim.worlds.floor_plan import WALL_HEIGHT_M, Plan, box_corners, check_margins, rectangle_corners
+from sim.worlds.floor_plan import (
+    WALL_HEIGHT_M,
+    Plan,
+    box_corners,
+    check_cells,
+    check_margins,
+    rectangle_corners,
+)
+from sim.worlds.furnished import FurnishedOptions
 from sim.worlds.grid_file import read_grid
+from sim.worlds.grid_tour import plan_tour
 from sim.worlds.town import lawn, terrace, town
+from sim.worlds.vary import Shares, vary
 from sim.worlds.world import World, facing_second
 from sim.worlds.world_file import check_tour, read_world
 
@@ -38,7 +48,11 @@ def from_file(*, rng: np.random.Generator, path: str) -> World:
 
 
 def from_grid(
-    *, rng: np.random.Generator, path: str | None = None, waypoints: Sequence[list[float]] = ()
+    *,
+    rng: np.random.Generator,
+    path: str | None = None,
+    waypoints: Sequence[list[float]] = (),
+    stops: int = 0,
 ) -> World:
     """Draw a world from an occupancy grid: a wall along each border of its occupied cells.
 
@@ -48,11 +62,14 @@ def from_grid(
         The grid's YAML file; see `sim.worlds.grid_file`.
     waypoints
         [[x, y], ...] m: the tour. A grid has none of its own, so the route needs way-points if
-        these are fewer than two.
+        these are fewer than two and `stops` is 0.
+    stops
+        Places, drawn at random, of a tour that is planned if there are no way-points; 2 or more, or
+        0 for none.
     """
-    del rng
     path = required(path, "world.path must name a grid's .yaml, such as one `estima map` wrote")
-    walls = read_grid(path).walls()
+    grid = read_grid(path)
+    walls = grid.walls()
     require(
         len(walls) <= _MOST_GRID_WALLS,
         f"{path}: {len(walls)} walls, and {_MOST_GRID_WALLS} are the most; clean the grid, or "
@@ -62,6 +79,9 @@ def from_grid(
         tour = np.array(waypoints, float).reshape(-1, 2)
     except (TypeError, ValueError):
         raise InputError(f"world.waypoints must be points [x, y], m, got {waypoints!r}") from None
+    require(stops == 0 or stops >= 2, f"world.stops must be 0, or 2 or more, got {stops}")
+    if len(tour) == 0 and stops:
+        tour = plan_tour(grid, stops, rng)
     check_tour(tour, walls, Path(path))
     return World(
         name=Path(path).stem,
@@ -90,13 +110,8 @@ def room(
     a, b = 1.2, (length_m - 1.2, width_m - 1.2)
     plan.tour = [(a, a), (b[0], a), (b[0], b[1]), (a, b[1]), (a, a)]
     plan.furnish(rng, (0, 0), (length_m, width_m), n_objects, size_m=(0.3, 1.0), clearance_m=0.45)
-    return plan.world(
-        "room",
-        rng,
-        n_landmarks=n_landmarks,
-        look_alike_share=look_alike_share,
-        changed_share=changed_share,
-    )
+    world = plan.world("room", rng, n_landmarks=n_landmarks, look_alike_share=look_alike_share)
+    return vary(plan, world, rng, Shares(changed_share))
 
 
 def boxes(
@@ -115,17 +130,12 @@ def boxes(
     a, b = 1.2, side_m - 1.2
     plan.tour = [(a, a), (b, a), (b, b), (a, b), (a, a)]
     plan.furnish(rng, (0, 0), (side_m, side_m), n_boxes, clearance_m=0.5)
-    return plan.world(
-        "boxes",
-        rng,
-        n_landmarks=n_landmarks,
-        look_alike_share=look_alike_share,
-        changed_share=changed_share,
-    )
+    world = plan.world("boxes", rng, n_landmarks=n_landmarks, look_alike_share=look_alike_share)
+    return vary(plan, world, rng, Shares(changed_share))
 
 
 @options("world")
-class Rooms:
+class Rooms(FurnishedOptions):
     """n_x by n_y square rooms with a door between all neighbours.
 
     The tour goes from room to room: round the outer ring, then, where there is one, round the
@@ -140,17 +150,13 @@ class Rooms:
     n_landmarks: NonNegativeInt = 200
     on_walls_share: Share = 0.7
     """Share of the landmarks on walls; the others are on objects."""
-    look_alike_share: Share = 0.0
-    """Share of the landmarks that look like another one."""
-    changed_share: Share = 0.0
-    """Share of the objects that have changed since the map was made that estimators get: a third of
-    them stand elsewhere in it, are not in it, and have another like them beside."""
 
     def __post_init__(self) -> None:
         require(
             self.n_x * self.n_y >= 2,
             f"world.n_x and n_y must make at least two rooms, got {self.n_x} x {self.n_y}",
         )
+        check_cells(self.n_x, self.n_y)
         room_m, door_m = self.room_m, self.door_m
         check_margins(room_m=room_m - 2.0, door_m=door_m - 0.7, wall=room_m - door_m)
 
@@ -171,18 +177,11 @@ class Rooms:
         plan.tour = [((i + 0.5) * room_m, (j + 0.5) * room_m) for i, j in _grid_tour(n_x, n_y)]
         for low in corners:
             plan.furnish(rng, low, np.add(low, room_m).tolist(), self.objects_per_room)
-        return plan.world(
-            "rooms",
-            rng,
-            n_landmarks=self.n_landmarks,
-            on_walls_share=self.on_walls_share,
-            look_alike_share=self.look_alike_share,
-            changed_share=self.changed_share,
-        )
+        return self.finish(plan, "rooms", rng, self.on_walls_share)
 
 
 @options("world")
-class Corridor:
+class Corridor(FurnishedOptions):
     """A bare stretch, objects, a bare stretch, a sharp bend, a leg, a round curve, a leg.
 
     Both turn left. The place `corridor_bare` stops 3 m short of the end wall and of the objects,
@@ -200,11 +199,6 @@ class Corridor:
     width_m: float = 2.2
     n_objects: NonNegativeInt = 8
     n_landmarks: NonNegativeInt = 80
-    look_alike_share: Share = 0.0
-    """Share of the landmarks that look like another one."""
-    changed_share: Share = 0.0
-    """Share of the objects that have changed since the map was made that estimators get: a third of
-    them stand elsewhere in it, are not in it, and have another like them beside."""
 
     def __post_init__(self) -> None:
         check_margins(
@@ -243,13 +237,7 @@ class Corridor:
         middle = [(float(x), float(y)) for x, y in centre + r * arc]
         plan.tour = [(1.0, w / 2), (xc, w / 2), *middle, (far + 1.0, top + r)]
         _line_up(plan, rng, (x1, 0), (end, w), self.n_objects)
-        return plan.world(
-            "corridor",
-            rng,
-            n_landmarks=self.n_landmarks,
-            look_alike_share=self.look_alike_share,
-            changed_share=self.changed_share,
-        )
+        return self.finish(plan, "corridor", rng)
 
 
 def corridors(
@@ -275,6 +263,7 @@ def office(
     objects_per_room: int = 5,
     rooms_visited: int = 8,
     changed_share: float = 0.0,
+    doors_share: float = 0.0,
 ) -> World:
     """Build an office floor of 66 x 42 m: 22 furnished rooms on two corridor loops.
 
@@ -323,13 +312,8 @@ def office(
         _line_up(plan, rng, low, high, 7, keep_off=doors)
     for room in rooms:
         plan.furnish(rng, room.low, room.high, objects_per_room, size_m=(0.4, 1.6))
-    return plan.world(
-        "office",
-        rng,
-        n_landmarks=n_landmarks,
-        look_alike_share=look_alike_share,
-        changed_share=changed_share,
-    )
+    world = plan.world("office", rng, n_landmarks=n_landmarks, look_alike_share=look_alike_share)
+    return vary(plan, world, rng, Shares(changed_share, doors=doors_share))
 
 
 def streets(

@@ -8,14 +8,13 @@ import numpy as np
 
 from sim.arrays import Array, ArrayLike, Bools, Floats
 from sim.errors import InputError, require
-from sim.se2 import transform
 from sim.worlds.world import World, facing_second
 
 WALL_HEIGHT_M = 2.5
 DESCRIPTOR_SIZE = 128
 CHORD_ERROR_M = 1e-4  # between a polygon and what is round
+_MOST_CELLS, _MOST_LANDMARKS = 2_500, 1_000_000  # of a world
 _APART_M = 0.12  # between furniture and walls, and among furniture
-_MOVES_TRIED = 50
 _PROUD_M = 0.01  # landmarks stand this far off their face, so that rays see them from its side
 
 
@@ -40,6 +39,8 @@ class Plan:
     approaches
         x1, y1, x2, y2 of stretches that furniture keeps clear besides the tour: the ways
         through the doors.
+    doorways
+        x1, y1, x2, y2 of the gaps in walls.
     """
 
     faces: list[tuple[float, ...]] = field(default_factory=list)
@@ -52,6 +53,7 @@ class Plan:
     places: dict[str, list[tuple[float, float, float, float]]] = field(default_factory=dict)
     tour: list[tuple[float, float]] = field(default_factory=list)
     approaches: list[tuple[float, ...]] = field(default_factory=list)
+    doorways: list[tuple[float, ...]] = field(default_factory=list)
 
     def wall(
         self,
@@ -70,6 +72,9 @@ class Plan:
             if low - begin > 1e-6:
                 a, b = np.asarray(start) + begin * unit, np.asarray(start) + low * unit
                 self._face((a[0], a[1], b[0], b[1]), (0.0, top_m), on_object=False)
+            if high > low:
+                a, b = np.asarray(start) + low * unit, np.asarray(start) + high * unit
+                self.doorways.append((*a.tolist(), *b.tolist()))
             begin = max(begin, high)
 
     def enclosure(self, corners: ArrayLike) -> None:
@@ -214,13 +219,8 @@ class Plan:
         n_landmarks: int = 0,
         on_walls_share: float = 0.7,
         look_alike_share: float = 0.0,
-        changed_share: float = 0.0,
     ) -> World:
-        """Finish the world, with landmarks scattered over its faces.
-
-        `changed_share` of its objects stand elsewhere on the map that estimators get, or are on it
-        or in the world alone.
-        """
+        """Finish the world, with landmarks scattered over its faces."""
         walls = np.array(self.faces, float).reshape(-1, 4)
         heights = np.array(self.heights, float).reshape(-1, 2)
         landmarks = self._landmarks(rng, n_landmarks, on_walls_share)
@@ -230,37 +230,7 @@ class Plan:
         # The smallest first, so that a door is not taken for the room it leads to.
         places = {k: np.array(v, float) for k, v in self.places.items()}
         places = dict(sorted(places.items(), key=lambda item: _mean_area(item[1])))
-        known = self._of_another_day(rng, changed_share)
-        return World(
-            name, walls, heights, landmarks, descriptors, alike, places, start, tour, *known
-        )
-
-    def _of_another_day(
-        self, rng: np.random.Generator, share: float
-    ) -> tuple[Array, Array] | tuple[None, None]:
-        """Faces (K, 4) and heights (K, 2) with a share of the objects changed.
-
-        A third of them each are somewhere else in the same room, are missing, and have another like
-        them near by. The generator's own stream is left as it is.
-        """
-        require(0.0 <= share <= 1.0, f"world.changed_share must lie in [0, 1], got {share}")
-        if share == 0.0 or not self.objects:
-            return None, None
-        (rng,) = rng.spawn(1)
-        faces, heights = np.array(self.faces), np.array(self.heights)
-        fixed = faces[~np.array(self.on_object)]
-        kept = np.ones(len(faces), bool)
-        added: list[tuple[Array, Array]] = []
-        changed = rng.permutation(len(self.objects))[: round(share * len(self.objects))]
-        for number, which in enumerate(changed):
-            rows = slice(*self.objects[which])
-            kept[rows] = number % 3 == 2  # of these another one is added
-            if number % 3 != 1:
-                added.append((_moved_near(faces[rows], fixed, rng), heights[rows]))
-        return (
-            np.concatenate([faces[kept], *(moved for moved, _ in added)]),
-            np.concatenate([heights[kept], *(own for _, own in added)]),
-        )
+        return World(name, walls, heights, landmarks, descriptors, alike, places, start, tour)
 
     def _face(self, ends: Sequence[float], height: tuple[float, float], *, on_object: bool) -> None:
         self.faces.append(tuple(map(float, ends)))
@@ -294,7 +264,10 @@ class Plan:
 
     def _landmarks(self, rng: np.random.Generator, count: int, on_walls_share: float) -> Array:
         """Landmarks (count, 3), spread over walls and objects by the faces' lengths."""
-        require(count >= 0, f"world.n_landmarks must be zero or more, got {count}")
+        require(
+            0 <= count <= _MOST_LANDMARKS,
+            f"world.n_landmarks must be from zero to {_MOST_LANDMARKS}, got {count}",
+        )
         require(
             0.0 <= on_walls_share <= 1.0,
             f"world.on_walls_share must lie in [0, 1], got {on_walls_share}",
@@ -344,21 +317,7 @@ class Plan:
         return free
 
 
-def _moved_near(faces: Array, walls: Array, rng: np.random.Generator) -> Array:
-    """Faces (N, 4) of an object, turned and moved by up to 1.5 m within the room with walls."""
-    ends = faces.reshape(-1, 2)
-    centre = ends.mean(axis=0)
-    for _ in range(_MOVES_TRIED):
-        angle, way = rng.uniform(-math.pi, math.pi, 2)
-        shift = rng.uniform(0.4, 1.5) * np.array([math.cos(way), math.sin(way)])
-        moved = transform([*(centre + shift), angle], ends - centre).reshape(-1, 4)
-        through = np.concatenate([centre, centre + shift])[None]
-        if not len(walls) or gaps_m(np.vstack([moved, through]), walls).min() > 0.02:
-            return moved
-    return faces
-
-
-def rectangle_corners(low: Sequence[float], high: Sequence[float]) -> Array:
+def rectangle_corners(low: Sequence[float] | Array, high: Sequence[float] | Array) -> Array:
     """Corners (4, 2), m, counter-clockwise."""
     return np.array([(low[0], low[1]), (high[0], low[1]), (high[0], high[1]), (low[0], high[1])])
 
@@ -418,7 +377,9 @@ def _mean_area(rectangles: Array) -> float:
     return float(np.mean(np.prod(rectangles[:, 2:] - rectangles[:, :2], axis=1)))
 
 
-def box_corners(centre: Sequence[float], size: Sequence[float] | Array, yaw_rad: float) -> Array:
+def box_corners(
+    centre: Sequence[float] | Array, size: Sequence[float] | Array, yaw_rad: float
+) -> Array:
     """Corners (4, 2), m, counter-clockwise."""
     half = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * np.asarray(size) / 2
     cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
@@ -446,7 +407,9 @@ def arc_points(
 ) -> Array:
     """Points (N, 2), m, on an arc between two angles, ends included."""
     sweep = abs(ends_rad[1] - ends_rad[0])
-    angle = np.linspace(*ends_rad, max(math.ceil(sweep / arc_step_rad(radius_m)), 1) + 1)
+    angle = np.linspace(
+        ends_rad[0], ends_rad[1], max(math.ceil(sweep / arc_step_rad(radius_m)), 1) + 1
+    )
     return np.asarray(centre) + radius_m * np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
@@ -475,6 +438,14 @@ def make_descriptors(
             raw[rows[-1]] = raw[rows[0]]
     unit = raw / np.linalg.norm(raw, axis=1, keepdims=True) if count else raw
     return unit.astype(np.float32), alike
+
+
+def check_cells(n_x: int, n_y: int) -> None:
+    """Check that a grid of rooms or blocks is one that can be built: InputError."""
+    require(
+        n_x * n_y <= _MOST_CELLS,
+        f"world.n_x and n_y make {n_x * n_y} rooms or blocks; {_MOST_CELLS} are the most",
+    )
 
 
 def check_margins(**margins: float) -> None:

@@ -1,6 +1,8 @@
 """Worlds where straight walls are few: clutter, curves, corridors that look alike, a large hall."""
 
+import functools
 import math
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from typing import Annotated, NamedTuple
 
@@ -19,32 +21,14 @@ from sim.worlds.floor_plan import (
     rectangle_corners,
     round_corners,
 )
+from sim.worlds.furnished import FurnishedOptions
 from sim.worlds.world import World
 
+Outline = Callable[[np.random.Generator], Array]
+Drawing = Callable[[Plan, Array, np.random.Generator], None]
 _OFF_TOUR_M = 0.6  # furniture, from the tour
 _TABLE_M, _SEAT_M = 0.74, 0.45  # heights of table tops and seats
 _CLOSE_M = 3.0  # off walls and objects: where corridors count as bare
-
-
-@options("world")
-class FurnishedOptions:
-    """What worlds with objects and landmarks have in common."""
-
-    n_landmarks: NonNegativeInt = 100
-    look_alike_share: Share = 0.0
-    """Share of the landmarks that look like another one."""
-    changed_share: Share = 0.0
-    """Share of the objects that have changed since the map was made that estimators get: a third of
-    them stand elsewhere in it, are not in it, and have another like them beside."""
-
-    def _finish(self, plan: Plan, name: str, rng: np.random.Generator) -> World:
-        return plan.world(
-            name,
-            rng,
-            n_landmarks=self.n_landmarks,
-            look_alike_share=self.look_alike_share,
-            changed_share=self.changed_share,
-        )
 
 
 @options("world")
@@ -75,17 +59,15 @@ class Clutter(FurnishedOptions):
             (left, south), (middle, south), (middle, between), (right, between), (right, north),
             (middle, north), (middle, between), (left, between), (left, south),
         ]  # fmt: skip
-        for count, outline, draw in (
-            (self.n_tables, lambda own: _turned(1.9, 1.9, own), self._table),
-            (self.n_boxes, lambda own: _turned(*own.uniform(0.25, 0.9, 2), own), _box),
+        things: tuple[tuple[int, Outline, Drawing], ...] = (
+            (self.n_tables, lambda own: _turned((1.9, 1.9), own), self._table),
+            (self.n_boxes, lambda own: _turned(own.uniform(0.25, 0.9, 2), own), _box),
             (self.n_plants, lambda own: round_corners((0.0, 0.0), own.uniform(0.2, 0.35)), _plant),
-        ):
-            plan.put(
-                rng, (low, high), count, outline,
-                lambda corners, own, draw=draw: draw(plan, corners, own),
-                clearance_m=_OFF_TOUR_M,
-            )  # fmt: skip
-        return self._finish(plan, "clutter", rng)
+        )
+        for count, outline, draw in things:
+            put = functools.partial(draw, plan)
+            plan.put(rng, (low, high), count, outline, put, clearance_m=_OFF_TOUR_M)
+        return self.finish(plan, "clutter", rng)
 
     def _table(self, plan: Plan, corners: Array, rng: np.random.Generator) -> None:
         """A table on four square legs in the middle of an outline, and chairs pushed in askew."""
@@ -126,9 +108,9 @@ def _plant(plan: Plan, corners: Array, rng: np.random.Generator) -> None:
     plan.prism(round_corners(centre, 0.9 * radius), top + 0.3, top + 1.0, joined=True)
 
 
-def _turned(length_m: float, width_m: float, rng: np.random.Generator) -> Array:
+def _turned(size: Sequence[float] | Array, rng: np.random.Generator) -> Array:
     """Corners (4, 2) of a box about the origin, turned at random."""
-    return box_corners((0.0, 0.0), (length_m, width_m), rng.uniform(0.0, math.pi))
+    return box_corners((0.0, 0.0), size, rng.uniform(0.0, math.pi))
 
 
 @options("world")
@@ -183,10 +165,10 @@ class Curved(FurnishedOptions):
             clearance_m=_OFF_TOUR_M,
         )  # fmt: skip
         plan.put(
-            rng, (low, high), self.n_screens, lambda own: _turned(1.8, 0.7, own),
+            rng, (low, high), self.n_screens, lambda own: _turned((1.8, 0.7), own),
             lambda corners, own: _screen(plan, corners), clearance_m=_OFF_TOUR_M,
         )  # fmt: skip
-        return self._finish(plan, "curved", rng)
+        return self.finish(plan, "curved", rng)
 
     def _outline(self) -> Array:
         """Corners (N, 2) of the hall, counter-clockwise."""
@@ -204,7 +186,8 @@ class Curved(FurnishedOptions):
             arc_points((r, width - r), r, (quarter, 2 * quarter)),
             arc_points((r, r), r, (2 * quarter, 3 * quarter)),
         ])  # fmt: skip
-        return ring[np.hypot(*(ring - np.roll(ring, 1, axis=0)).T) > 1e-6]
+        apart = np.hypot(*(ring - np.roll(ring, 1, axis=0)).T) > 1e-6
+        return np.asarray(ring[apart])
 
     def _eight(self, wells: list[Array]) -> list[tuple[float, float]]:
         """Way round one stairwell and then, the other way, round the other."""
@@ -291,7 +274,7 @@ class CorridorsAlike(FurnishedOptions):
         if plan.tour[-1][0] == east:
             plan.tour.append((west, plan.tour[-1][1]))
         plan.tour.append((west, w / 2))
-        return self._finish(plan, "corridors_alike", rng)
+        return self.finish(plan, "corridors_alike", rng)
 
     def _cabinet(self, number: int, rng: np.random.Generator) -> _Cabinet:
         pitch = (self.length_m - 2.0) / max(self.n_cabinets, 1)
@@ -343,7 +326,7 @@ class Hall(FurnishedOptions):
             lambda ring, own: plan.prism(ring, 0.0, 6.0), clearance_m=1.0,
         )  # fmt: skip
         plan.put(
-            rng, area, self.n_boxes, lambda own: _turned(*own.uniform(0.8, 3.0, 2), own),
-            lambda ring, own: _box(plan, ring, own), clearance_m=1.0,
+            rng, area, self.n_boxes, lambda own: _turned(own.uniform(0.8, 3.0, 2), own),
+            functools.partial(_box, plan), clearance_m=1.0,
         )  # fmt: skip
-        return self._finish(plan, "hall", rng)
+        return self.finish(plan, "hall", rng)

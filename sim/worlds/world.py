@@ -1,8 +1,9 @@
 """World: upright walls, point landmarks and named places, in the frame `map` (metres)."""
 
-import dataclasses
+from __future__ import annotations
+
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 
 import numpy as np
@@ -64,6 +65,8 @@ class World:
         nothing has changed since. Landmarks are as they are driven past.
     materials
         (W,) `Material` of each face; None where all are plaster.
+    doors
+        (D, 4) m: feet of doors that open and close, as they are when closed; None without any.
     """
 
     name: str
@@ -78,6 +81,7 @@ class World:
     known_walls: Array | None = None
     known_wall_z_m: Array | None = None
     materials: Ints | None = None
+    doors: Array | None = None
 
     def __post_init__(self) -> None:
         shapes = {
@@ -88,6 +92,8 @@ class World:
             "waypoints": (self.waypoints, (len(self.waypoints), 2)),
             **{f"places.{k}": (v, (len(v), 4)) for k, v in self.places.items()},
         }
+        if self.doors is not None:
+            shapes["doors"] = self.doors, (len(self.doors), 4)
         if self.known_walls is not None and self.known_wall_z_m is not None:
             shapes["known_walls"] = self.known_walls, (len(self.known_walls), 4)
             shapes["known_wall_z_m"] = self.known_wall_z_m, (len(self.known_walls), 2)
@@ -124,11 +130,11 @@ class World:
             raise InputError(f"world {self.name}: wall {bad} has its top below its bottom")
 
     @property
-    def known(self) -> "World":
+    def known(self) -> World:
         """The world as its map has it, which may be of another day."""
         if self.known_walls is None or self.known_wall_z_m is None:
             return self
-        return dataclasses.replace(
+        return replace(
             self,
             walls=self.known_walls,
             wall_z_m=self.known_wall_z_m,
@@ -156,6 +162,19 @@ class World:
             ]
         )
         return np.concatenate([points.min(axis=0), points.max(axis=0)])
+
+    def as_map(self) -> World:
+        """Return what a map shows of the world: neither where a robot starts, nor its tour.
+
+        Nor does it show what has changed since, of what walls are made, and doors.
+        """
+        return replace(
+            self.known,
+            start_pose=np.zeros(3),
+            waypoints=np.zeros((0, 2)),
+            materials=None,
+            doors=None,
+        )
 
     def place_of(self, points_in_world: Array) -> NDArray[np.str_]:
         """Name of the first place that holds each point (N, 2), or an empty string."""
