@@ -86,7 +86,7 @@ DEFAULTS = {
     "KissIcp": "105071ed",
     "Laser": "e752606f",
     "Lidar3D": "29cea5d0",
-    "Mcl": "34e73d99",
+    "Mcl": "ebb5ea64",
     "Odometry": "8ff5b00a",
     "Offline": "f6fdb4d2",
     "PlaceDescriptor": "af6aa1df",
