@@ -16,8 +16,9 @@ from omegaconf import OmegaConf
 
 from estimators.base import Estimator
 from experiments.runs import paths
+from experiments.runs.columns import DEPENDENCIES
 from experiments.runs.compose import name_study_files, open_composer
-from experiments.runs.key import effective_config, run_key, version_of
+from experiments.runs.key import effective_config, run_key
 from experiments.runs.objects import OF_TEAMS, Objects, is_grid_file
 from experiments.runs.row import Row
 from experiments.runs.schema import (
@@ -31,6 +32,7 @@ from experiments.runs.schema import (
 )
 from experiments.runs.seeds import stream
 from experiments.runs.targets import check_target
+from experiments.runs.version import code_version
 from sim.errors import InputError, require
 from sim.options import build, find
 from sim.recording import Recording
@@ -144,7 +146,7 @@ class Experiment(Objects):
         return run_key(self.config)
 
     def labels(self, checksum: str) -> Row:
-        """Columns that state a row's origin: choices, keys, versions, the recording's checksum.
+        """Columns that state a row's origin: choices, keys, version, the recording's checksum.
 
         Settings that did not make the recording have no column.
         """
@@ -156,7 +158,8 @@ class Experiment(Objects):
             **_flat({k: v for k, v in stated.items() if k not in ("keep", "picture")}),
             "repeat": 0,
             "run_key": self.key,
-            "code_version": version_of(self.config),
+            "code_version": code_version(),
+            DEPENDENCIES: "",
             "recording_checksum": checksum,
         }
 

@@ -13,7 +13,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from experiments.runs.columns import ORIGIN, STATUS
+from experiments.runs.columns import DEPENDENCIES, ORIGIN, STATUS
 from sim.errors import InputError, require
 from sim.files import require_file, write_whole
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 Row = dict[str, str | int | float | bool | None]
-_TEXTS = (*STATUS, *ORIGIN)
+_TEXTS = (*STATUS, *ORIGIN, DEPENDENCIES)
 WITH_DIGEST = re.compile(r".+\.([0-9a-f]{16})\.parquet")
 GAP = "gap"  # the code of a run that gave no pose for some of the drive
 
@@ -73,7 +73,7 @@ def check_row(row: Row) -> None:
         If a value is not a scalar that a table can hold, the status is missing, or a number is
         NaN though the status is ok.
     """
-    for key in _TEXTS:
+    for key in (*STATUS, *ORIGIN):
         require(isinstance(row.get(key), str), f"a row must have the text {key}")
     for key, value in row.items():
         flat = value is None or isinstance(value, (str, int, float, bool))

@@ -69,11 +69,3 @@ def check_target(
             bare = parameter.default is parameter.empty
             require(not bare, f"{where}.{name} is missing; {target} needs it")
     return function
-
-
-def list_targets(tree: Any) -> set[str]:
-    """Every `_target_` of a configuration."""
-    if not isinstance(tree, Mapping):
-        return set()
-    here = {tree["_target_"]} if isinstance(tree.get("_target_"), str) else set()
-    return here.union(*(list_targets(value) for value in tree.values()))

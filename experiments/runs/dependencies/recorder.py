@@ -27,7 +27,8 @@ from experiments.runs.paths import SOURCE
 
 Digests = Mapping[str, str]  # of each dependency, by its name
 _HOUSE = ("sim", "estimators", "experiments", "estima")
-_BUILT = (".py", ".pyc", ".so", ".nbi", ".nbc", ".lock", ".pth")  # modules, and their caches
+_BUILT = (".py", ".pyc", ".so", ".nbi", ".nbc", ".pth")  # modules, and their caches
+_OURS = (".lock", ".journal")
 _SYSTEM = ("/proc/", "/sys/", "/dev/", "/etc/", "/usr/", "/lib", str(Path.home() / ".cache"))
 _WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT
 
@@ -57,8 +58,9 @@ class Recorder:
         found = {"package python": package_version("python") or "", **self.noted, **code}
         for path in map(Path, sorted(read - self.written)):
             with suppress(OSError):
-                if path.is_file():
-                    found[name_of(path)] = digest_of(path)
+                name = name_of(path)
+                if path.is_file() and not name.startswith("results/cache/"):
+                    found[name] = digest_of(path)
         for program, words, folder in self.commands:
             found |= _command_digests(program, words, folder)
         return dict(sorted(found.items()))
@@ -134,17 +136,17 @@ class _Watch:
     def _see_import(
         self,
         name: str,
-        globals: Mapping[str, Any] | None = None,
-        locals: Mapping[str, Any] | None = None,
+        importer: Mapping[str, Any] | None = None,
+        names: Mapping[str, Any] | None = None,
         fromlist: Any = (),
         level: int = 0,
     ) -> Any:
         """Import as ever, and note what a statement inside a function imports."""
-        module = self._import(name, globals, locals, fromlist, level)
-        if globals is None or _kind(globals.get("__name__", "")) != "library":
+        module = self._import(name, importer, names, fromlist, level)
+        if importer is None or _kind(importer.get("__name__", "")) != "library":
             whole = "." * level + name
-            if level and globals is not None:
-                whole = importlib.util.resolve_name(whole, globals.get("__package__") or "")
+            if level and importer is not None:
+                whole = importlib.util.resolve_name(whole, importer.get("__package__") or "")
             for recorder in self.recorders:
                 recorder.modules.update([whole, *(f"{whole}.{part}" for part in fromlist or ())])
         return module
@@ -166,7 +168,7 @@ class _Watch:
         if isinstance(path, int):
             return
         text = os.path.abspath(os.fsdecode(path))
-        if text.endswith(_BUILT) or not _counts(text):
+        if text.endswith(_BUILT + _OURS) or not _counts(text):
             return
         writing = any(sign in mode for sign in "wax+") if mode else bool(flags & _WRITING)
         for recorder in self.recorders:
@@ -198,9 +200,14 @@ def _caller() -> str:
 
 
 def _reader() -> str:
-    """Module from elsewhere that reads a file, or any that reads one as it is loaded."""
+    """Module from elsewhere that reads a file, or any that reads one as it is loaded.
+
+    A script that calls us is not what reads.
+    """
     for frame in _frames():
         name = str(frame.f_globals.get("__name__", ""))
+        if name in ("__main__", "__mp_main__"):
+            continue
         kind = _kind(name)
         if kind == "own" or (kind == "house" and frame.f_code.co_name == "<module>"):
             return name
@@ -211,7 +218,7 @@ def _reader() -> str:
 def _kind(name: str) -> str:
     """Whose a loaded module is: `house`, `own` (the user's) or `library`."""
     top, file = name.partition(".")[0], getattr(sys.modules.get(name), "__file__", None)
-    if top in _HOUSE:
+    if top in _HOUSE or (file is not None and file.startswith(f"{SOURCE}/experiments/")):
         return "house"
     library = top in sys.stdlib_module_names - {"__main__"} or file is None or _is_installed(file)
     return "library" if library else "own"
@@ -223,10 +230,10 @@ def _is_installed(file: str) -> bool:
 
 
 def _counts(path: str) -> bool:
-    """Whether a file can be a dependency: not one of the system, of packages, or of our cache."""
+    """Whether a file can be a dependency: not one of the system, or of installed packages."""
     if path.startswith(f"{SOURCE}/") and not path.startswith(f"{SOURCE}/."):
-        return "/results/cache/" not in path
-    return not (path.startswith(_SYSTEM) or _is_installed(path) or "/cache/recordings/" in path)
+        return True
+    return not (path.startswith(_SYSTEM) or _is_installed(path))
 
 
 @functools.cache

@@ -100,7 +100,7 @@ def _imports(body: list[ast.stmt]) -> Iterator[str]:
         elif isinstance(node, ast.ImportFrom):
             base = "." * node.level + (node.module or "")
             yield base
-            yield from (f"{base.rstrip('.') and base + '.' or base}{a.name}" for a in node.names)
+            yield from (f"{(base.rstrip('.') and base + '.') or base}{a.name}" for a in node.names)
         elif isinstance(node, ast.If) and ast.unparse(node.test).endswith("TYPE_CHECKING"):
             yield from _imports(node.orelse)
         elif not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
