@@ -1,6 +1,5 @@
 """Make all papers' tables, figures and claims in results/, as `make reproduce` does."""
 
-import importlib
 import os
 import re
 import sys
@@ -8,7 +7,6 @@ import tempfile
 import time
 from collections import Counter
 from pathlib import Path
-from types import ModuleType
 
 from experiments.judging.claim import Claim, Verdict
 from experiments.judging.claims_file import (
@@ -18,7 +16,8 @@ from experiments.judging.claims_file import (
     write_claims,
     write_verdicts,
 )
-from experiments.judging.folders import code_folder, findings
+from experiments.judging.folders import LOGS, OWN, PAPERS, STUDIES, findings
+from experiments.judging.folders import part as _part
 from experiments.judging.logs import why_missing
 from experiments.judging.results import Profile, Results
 from experiments.judging.sentences import Conclusion, conclude
@@ -28,14 +27,6 @@ from experiments.runs.paths import results, short
 from experiments.viewing.style import save_figure
 from sim.errors import InputError
 
-PAPERS = ("puzzlebot2024", "decristoforis2020", "maximo2024", "gil2008")
-LOGS = ("real_logs", "twins")  # run only where the logs are
-NAMED = ("teams", "exploration")  # judged, run when named
-OWN = (
-    "mcl_office",
-    "fastslam_consistency",
-    "peers",
-)  # our own, which judge no claim: run when named
 _APART = "_tuning"  # the table on other seeds from which parameters were chosen
 
 
@@ -167,15 +158,9 @@ def _put_in_place(new: Path, old: Path, paper: str) -> None:
 
 
 def _chosen(only: str | None) -> tuple[str, ...]:
-    known = (*PAPERS, *LOGS, *NAMED, *OWN)
-    if only is not None and only not in known:
-        raise InputError(f"--paper must be one of {', '.join(known)}, got {only!r}")
+    if only is not None and only not in STUDIES:
+        raise InputError(f"--paper must be one of {', '.join(STUDIES)}, got {only!r}")
     return (*PAPERS, *LOGS) if only is None else (only,)
-
-
-def _part(paper: str, name: str) -> ModuleType:
-    room = code_folder(paper).parent.name
-    return importlib.import_module(f"experiments.{room}.{paper}.{name}")
 
 
 def first_sentence(text: str) -> str:

@@ -37,6 +37,28 @@ def reproduce(
         reproduce_papers(full=full, only=paper)
 
 
+def audit(
+    minutes: Annotated[float, typer.Option(help="About how long.")] = 2.0,
+    rows: Annotated[int | None, typer.Option(help="So many rows, however long.")] = None,
+    seed: Annotated[int, typer.Option(help="Of the draw.")] = 0,
+) -> None:
+    """Make rows of the judged tables again, drawn at random; code 1 if one differs.
+
+    Some are behind the headlines of the claims, the others are drawn evenly from all. Computing
+    times do not count. The last line says what share of all rows can differ.
+
+    Examples
+    --------
+      estima audit
+
+      estima audit --rows 200 --seed 7
+    """
+    from experiments.audit import audit as audit_tables
+
+    if not audit_tables(minutes, rows, seed):
+        raise typer.Exit(1)
+
+
 def bench(
     name: Annotated[
         str,

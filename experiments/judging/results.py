@@ -29,6 +29,11 @@ _MISFITS = (
 )
 
 
+def write_table(frame: pd.DataFrame, path: Path) -> None:
+    """Write a table of a study, its numbers with twelve digits."""
+    write_frame(frame, path, digits=12)
+
+
 class Profile(StrEnum):
     """The size of a study: `quick` makes every table and figure from few repeats."""
 
@@ -49,7 +54,7 @@ class Results:
     def write_tables(self, **frames: pd.DataFrame) -> None:
         """Write tables by name."""
         for name, frame in frames.items():
-            write_frame(frame, self._path("tables", f"{name}.csv"), digits=12)
+            write_table(frame, self._path("tables", f"{name}.csv"))
 
     def table(self, name: str) -> pd.DataFrame:
         """Read a table.

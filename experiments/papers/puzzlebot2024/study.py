@@ -22,6 +22,7 @@ from experiments.calibration.end_poses import Manoeuvre, from_end_poses
 from experiments.calibration.result import CalibrationResult
 from experiments.evaluation.metrics import ellipse_area_m2, travelled_m
 from experiments.judging.jobs import Progress, Tables, tables_of
+from experiments.judging.remake import Remake, agrees, whole
 from experiments.judging.results import Profile, Results
 from experiments.papers.puzzlebot2024.descent import convergence, gradient_descent
 from experiments.papers.puzzlebot2024.settings import (
@@ -80,6 +81,55 @@ def run(profile: Profile, out: Results, on_progress: Progress) -> None:
     driven = engine_recordings(*FEW_SEEDS[profile])
     out.write_tables(engine=engine_ends(driven), engine_k=engine_k(driven))
     on_progress(1.0)
+
+
+REMADE = {
+    "areas": 1.0,
+    "calibration": 3.0,
+    "convergence": 0.5,
+    "coverage": 5.0,
+    "crossover": 0.5,
+    "engine": 10.0,
+    "gradient_descent": 0.5,
+    "short_turns": 3.0,
+    "short_turns_found": 3.0,
+    "square_feedback": 5.0,
+    "table_1": 1.0,
+}  # not engine_k, which comes from all drives at once
+
+
+def remake(table: str, row: Row) -> Remake:
+    """The call that makes a row again."""
+    sets = {"areas": areas, "gradient_descent": gradient_descent, "convergence": convergence}
+    if table in sets:
+        return whole, (table, sets[table])
+    makers = {"crossover": crossover, "engine": _engine_table, "square_feedback": _square_table}
+    if table in makers:
+        return whole, (table, makers[table], f"seed={row['seed']:.0f}")
+    if table in ("short_turns", "short_turns_found"):
+        return _short_turns_tables, ()
+    found = "coverage" if table == "table_1" else table
+    k_m = {"k_m": TABLE_1_K_M, **row}
+    arm = next(a for a in arms(found) if agrees(k_m, {"k_m": a.k_m, "joint": a.joint}))
+    if table == "table_1":
+        return whole, (table, table_1, arm)
+    if table == "calibration":
+        return _calibration_rows, (dataclasses.replace(arm, seed=int(row["seed"])),)
+    one = dataclasses.replace(arm, routes={row["case"]: arm.routes[row["case"]]})
+    return whole, (table, coverage, [one], COVERAGE_RUNS[Profile.FULL])
+
+
+def _engine_table(*overrides: str) -> pd.DataFrame:
+    return engine_ends(engine_recordings(*overrides))
+
+
+def _square_table(*overrides: str) -> pd.DataFrame:
+    return square_feedback(*overrides)[0]
+
+
+def _short_turns_tables() -> Tables:
+    ends, found = short_turns(*arms("short_turns"))
+    return {"short_turns": ends, "short_turns_found": found}
 
 
 @dataclass(frozen=True)
