@@ -78,6 +78,7 @@ _COMMANDS: dict[str, Callable[..., None]] = {  # as `estima --help` lists them
     "plot": tables.plot,
     "reproduce": project.reproduce,
     "audit": project.audit,
+    "results": project.list_results,
     "report": tables.report,
     "cache": project.cache,
     "export-table": tables.export_table,

@@ -125,8 +125,7 @@ class Results:
 
     @property
     def _remedy(self) -> str:
-        full = "" if self.folder.name == "quick" else "--full "
-        return f"run `estima reproduce {full}--paper {self.paper}`"
+        return f"run `estima reproduce --full --paper {self.paper}`"
 
 
 class _Arrays(Arrays):

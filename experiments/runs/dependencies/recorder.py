@@ -42,11 +42,14 @@ class Recorder:
         Names of modules whose code was used.
     noted
         What other processes, or the cache, have recorded.
+    parts
+        What each table depends on besides, and the seconds that it took, by its name.
     """
 
     def __init__(self, *modules: str) -> None:
         self.modules = set(modules)
         self.noted: dict[str, str] = {}
+        self.parts: dict[str, tuple[dict[str, str], float]] = {}
         self.read = set[str]()
         self.written = set[str]()
         self.commands: list[tuple[str, tuple[str, ...], str | None]] = []
@@ -88,6 +91,18 @@ def note(digests: Digests) -> None:
     """Add to what is being recorded what was recorded elsewhere."""
     for recorder in _WATCH.recorders:
         recorder.noted.update(digests)
+
+
+def note_part(name: str, digests: Digests, seconds: float) -> None:
+    """Add what a job has recorded and how long it took, of one of the tables that it gave."""
+    for recorder in _WATCH.recorders:
+        known, spent_s = recorder.parts.get(name, ({}, 0.0))
+        recorder.parts[name] = known | dict(digests), spent_s + seconds
+
+
+def is_recording() -> bool:
+    """Whether anything is being recorded."""
+    return bool(_WATCH.recorders)
 
 
 def digest_of_all(digests: Digests) -> str:
