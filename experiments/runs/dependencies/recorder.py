@@ -15,7 +15,7 @@ import shlex
 import shutil
 import sys
 import weakref
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType, ModuleType
@@ -151,17 +151,18 @@ class _Watch:
     def _see_import(
         self,
         name: str,
-        importer: Mapping[str, Any] | None = None,
-        names: Mapping[str, Any] | None = None,
-        fromlist: Any = (),
+        globals: Mapping[str, object] | None = None,  # noqa: A002 its own names
+        locals: Mapping[str, object] | None = None,  # noqa: A002
+        fromlist: Sequence[str] | None = (),
         level: int = 0,
-    ) -> Any:
+    ) -> ModuleType:
         """Import as ever, and note what a statement inside a function imports."""
-        module = self._import(name, importer, names, fromlist, level)
-        if importer is None or _kind(importer.get("__name__", "")) != "library":
+        module = self._import(name, globals, locals, fromlist, level)
+        if globals is None or _kind(str(globals.get("__name__", ""))) != "library":
             whole = "." * level + name
-            if level and importer is not None:
-                whole = importlib.util.resolve_name(whole, importer.get("__package__") or "")
+            if level and globals is not None:
+                package = str(globals.get("__package__") or "")
+                whole = importlib.util.resolve_name(whole, package)
             for recorder in self.recorders:
                 recorder.modules.update([whole, *(f"{whole}.{part}" for part in fromlist or ())])
         return module
