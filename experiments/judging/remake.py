@@ -65,9 +65,9 @@ def differing(row: Row, made: pd.DataFrame, tolerance: float = 0.0) -> list[str]
         Relative, of numbers; 0: to the last digit that is written.
     """
     columns = [str(name) for name in row if not is_time(str(name))]
-    absent = [name for name in columns if name not in made]
-    if absent or not len(made):
-        return absent or columns
+    if not len(made):
+        return columns
+    made = made.reindex(columns=columns)  # a column that has no value in these rows is not there
     equal = np.stack([_equal(made[name], row[name], tolerance) for name in columns])
     nearest = int(np.argmax(equal.sum(axis=0)))
     return [name for name, same in zip(columns, equal[:, nearest], strict=True) if not same]

@@ -12,6 +12,7 @@ from experiments.evaluation.statistics import log_ratio_interval
 from experiments.judging.jobs import Progress, Tables, answer_of, group_by, tables_of
 from experiments.judging.remake import Remake, agrees
 from experiments.judging.results import Profile, Results
+from experiments.runs.compose import find_option
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Outcome, Row
 from experiments.studies.peers.settings import LASER, PACKAGES, READS, TUNED
@@ -50,7 +51,8 @@ REMADE = {"runs": 15.0}  # methods are means of them
 
 def remake(_table: str, row: Row) -> Remake | None:
     """The call that makes a row again; None if its method is not here."""
-    given = ["study=peers", f"seed={row['seed']:.0f}", f"estimator={row['estimator']}"]
+    option = find_option("estimator", row["estimator"])
+    given = ["study=peers", f"seed={row['seed']:.0f}", f"estimator={option}"]
     for one in plan_experiments(given):
         if agrees(row, {name: one.choices[name] for name in ("world", "estimator")}):
             return None if missing(one) else (runs, ([one],))

@@ -175,7 +175,9 @@ def test_a_change_of_the_house_is_seen(tmp_path, monkeypatch):
     monkeypatch.setenv("ESTIMA_RESULTS", str(tmp_path / "results"))
     found = seen_by("estimator=odometry")
     for name in ("sim", "estimators", "experiments"):
-        shutil.copytree(SOURCE / name, tmp_path / name, ignore=shutil.ignore_patterns("__pycache__"))
+        shutil.copytree(
+            SOURCE / name, tmp_path / name, ignore=shutil.ignore_patterns("__pycache__")
+        )
     monkeypatch.setattr(digests, "SOURCE", tmp_path)
     assert changed(found) == []
     for name in ("sim/robot/slip.py", "estimators/odometry.py", "experiments/evaluation/metrics.py",
