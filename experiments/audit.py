@@ -20,8 +20,9 @@ from numpy.typing import NDArray
 
 from experiments.judging.claim import Claim, Role
 from experiments.judging.claims_file import read_provenance
-from experiments.judging.folders import OWN, STUDIES, part
+from experiments.judging.folders import LOGS, OWN, STUDIES, part
 from experiments.judging.jobs import in_parallel
+from experiments.judging.logs import why_missing
 from experiments.judging.remake import (
     ELSEWHERE,
     Remake,
@@ -167,26 +168,35 @@ def _behind(
         stratum = strata[name]
         for i in rng.permutation(len(stratum)):
             place, numbers = stratum[i]
-            if drawn := _drawn(tables, place, int(rng.choice(numbers)), name):
-                yield drawn
+            numbers = numbers[_are_here(tables, place)[numbers]]
+            if len(numbers):
+                yield _drawn(tables, place, int(rng.choice(numbers)), name)
                 break
 
 
 def _evenly(tables: Judged, rng: np.random.Generator) -> Iterator[Drawn]:
     """Give rows drawn evenly from all, without those that cannot be made again."""
-    places, sizes = list(tables), [len(table) for table in tables.values()]
-    firsts = np.cumsum([0, *sizes])
+    there = [(place, np.flatnonzero(_are_here(tables, place))) for place in tables]
+    firsts = np.cumsum([0, *(len(numbers) for _, numbers in there)])
     for number in rng.permutation(firsts[-1]):
         i = int(np.searchsorted(firsts, number, "right")) - 1
-        if drawn := _drawn(tables, places[i], int(number - firsts[i])):
-            yield drawn
+        place, numbers = there[i]
+        yield _drawn(tables, place, int(numbers[number - firsts[i]]))
 
 
-def _drawn(tables: Judged, place: Place, number: int, headline: str = "") -> Drawn | None:
-    cost_s = part(place.study, "study").REMADE.get(place.table)
-    if cost_s is None:
-        return None
+def _are_here(tables: Judged, place: Place) -> NDArray[np.bool_]:
+    """Which rows of a table can be made again here."""
+    table, study = tables[place], part(place.study, "study")
+    absent = place.study in LOGS and why_missing()
+    if place.table not in study.REMADE or absent:
+        return np.zeros(len(table), bool)
+    here: NDArray[np.bool_] = getattr(study, "are_here", lambda t: np.ones(len(t), bool))(table)
+    return here
+
+
+def _drawn(tables: Judged, place: Place, number: int, headline: str = "") -> Drawn:
     row: Row = {str(k): v for k, v in tables[place].iloc[number].to_dict().items()}
+    cost_s = part(place.study, "study").REMADE[place.table]
     return Drawn(place, number, row, cost_s, headline)
 
 
@@ -278,12 +288,11 @@ def summarize(found: Sequence[Finding], n_absent: int, tables: Judged) -> list[s
     lines = [str(finding) for finding in bad[:_MOST_LINES]]
     if len(bad) > _MOST_LINES:
         lines.append(f"and {pluralize(len(bad) - _MOST_LINES, 'row')} more")
-    left_out = [place for place in tables if _drawn(tables, place, 0) is None]
-    n_left_out, n_all = (sum(len(tables[p]) for p in each) for each in (left_out, tables))
+    here = np.concatenate([_are_here(tables, place) for place in tables])
     lines.append(
-        f"left out: {pluralize(len(left_out), 'table')} of means, times and drawings "
-        f"({100.0 * n_left_out / n_all:.1f} % of the rows)"
-        + (f", {pluralize(n_absent, 'row')} of logs or programs not here" if n_absent else "")
+        f"left out: {100.0 * np.mean(~here):.1f} % of the rows, which are means, times, drawings, or "
+        "of logs that are not here"
+        + (f"; {pluralize(n_absent, 'drawn row')} of programs that are not here" * bool(n_absent))
     )
     if any(tolerance(finding.drawn.place.study) for finding in found):
         lines.append(

@@ -17,9 +17,7 @@ def reproduce(
     stale: Annotated[
         bool, typer.Option("--stale", help="Make what is stale again, as `estima results` lists.")
     ] = False,
-    paper: Annotated[
-        str | None, typer.Option(help="Only this paper or study, with one of the other options.")
-    ] = None,
+    paper: Annotated[str | None, typer.Option(help="Make only this paper or study again.")] = None,
     figures_only: Annotated[
         bool, typer.Option("--figures-only", help="Redraw the figures from the tables in results/.")
     ] = False,
@@ -33,7 +31,7 @@ def reproduce(
     --------
       estima reproduce
 
-      estima reproduce --full --paper puzzlebot2024
+      estima reproduce --paper puzzlebot2024
 
       estima reproduce --stale
     """
@@ -42,15 +40,11 @@ def reproduce(
     require(
         full + stale + figures_only <= 1, "--full, --stale and --figures-only: give one of them"
     )
-    require(
-        paper is None or full or stale or figures_only,
-        f"--paper {paper}: say what to make: --full, --stale or --figures-only",
-    )
     if figures_only:
         made.redraw(only=paper)
     elif stale:
         made.renew(only=paper)
-    elif full:
+    elif full or paper is not None:
         made.reproduce(only=paper)
     elif not made.check_results(minutes):
         raise typer.Exit(1)

@@ -44,7 +44,7 @@ _TEXTS = {
     **{name: ("|".join(kind), f"one of {', '.join(kind)}") for name, kind in _ENUMS.items()},
 }
 _ORIGIN = ("profile", "seconds", "code_version")
-_REMEDY = "restore it by `git checkout`, or delete it and run `estima reproduce`"
+_REMEDY = "restore it by `git checkout`, or delete it and run `estima reproduce --full`"
 
 
 def write_claims(

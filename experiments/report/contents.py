@@ -53,7 +53,7 @@ FIRST = (
 )  # pictures for the first screen, the best first
 SMALL_ROWS, SMALL_COLUMNS = 60, 20  # a table up to here is shown whole
 FIRST_ROWS = 5  # of a larger one
-_REMEDY = "restore it by `git checkout`, or delete it and run `estima reproduce`"
+_REMEDY = "restore it by `git checkout`, or delete it and run `estima reproduce --full`"
 
 
 def contents(results: Path, on_progress: Callable[[float], None]) -> dict[str, Any]:

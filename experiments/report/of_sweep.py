@@ -132,7 +132,7 @@ def page_of_papers() -> Path:
     require(
         any((results / name).exists() for name in ("claims.csv", "figures", "tables")),
         f"{paths.short(results)}: no claims, figures or tables to report; "
-        "`estima reproduce` makes them, and `estima table NAME` shows a sweep",
+        "`estima reproduce --full` makes them, and `estima table NAME` shows a sweep",
     )
     with progress("report", 1.0) as on_progress:
         return write_report(results, on_progress)

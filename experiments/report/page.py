@@ -38,7 +38,7 @@ def write_report(results: Path, on_progress: Callable[[float], None] = lambda _:
     if found["missing"]:
         print(
             f"{results / 'claims.csv'}: no verdict on {', '.join(found['missing'])}, though others "
-            "of the paper have one; `git checkout results/claims.csv` or `estima reproduce`",
+            "of the paper have one; `git checkout results/claims.csv` or `estima reproduce --full`",
             file=sys.stderr,
         )
     path = results / "report.html"

@@ -151,13 +151,13 @@ def _jobs(full: bool, out: Results) -> list[Job]:
 
 
 REMADE = {
-    "runs": 60.0,
-    "steps": 60.0,
-    "covariances": 15.0,
-    "ellipses": 10.0,
-    "beliefs": 20.0,
-    "ordering": 5.0,
-    "metrics": 0.3,
+    "runs": 25.0,
+    "steps": 25.0,
+    "covariances": 3.0,
+    "ellipses": 3.5,
+    "beliefs": 10.0,
+    "ordering": 2.0,
+    "metrics": 0.1,
 }  # not pooled errors, and what only figures show
 
 

@@ -86,7 +86,7 @@ def plan(profile: Profile) -> Iterator[TableRun]:
                 yield table, one.replace(repeats=min(one.repeats, n_repeats))
 
 
-REMADE = dict.fromkeys(settings.LABELS, 2.0)  # not the times of `cost`
+REMADE = dict.fromkeys(settings.LABELS, 2.7)  # not the times of `cost`
 
 
 def remake(table: str, row: Row) -> Remake | None:

@@ -122,23 +122,27 @@ def _jobs(profile: Profile) -> list[tuple[Job, float]]:
 
 
 REMADE = {
-    "campus_starts": 40.0,
-    "clusters": 5.0,
-    "dispersion": 3.0,
-    "kidnapping": 4.0,
+    "campus_starts": 30.0,
+    "clusters": 2.0,
+    "dispersion": 4.0,
+    "kidnapping": 1.5,
     "particles": 4.0,
-    "quality": 5.0,
-    "runs": 20.0,
-    "starts": 3.0,
-    "weighting": 3.0,
+    "quality": 3.0,
+    "runs": 15.0,
+    "starts": 1.0,
+    "weighting": 4.0,
 }  # not means and times
 
 
-def remake(table: str, row: Row) -> Remake | None:
-    """The call that makes a row again; None without the real positions that it is from."""
+def are_here(table: pd.DataFrame) -> NDArray[np.bool_]:
+    """Which rows can be made here: those of the real positions only with them."""
+    real = table["geometry"].isin(("oxford_real", "oxford_runs"))
+    return np.asarray(~real | POSITIONS.is_file())
+
+
+def remake(table: str, row: Row) -> Remake:
+    """The call that makes a row again."""
     name = row["geometry"]
-    if name in ("oxford_real", "oxford_runs") and not POSITIONS.is_file():
-        return None
     of_route = dict.fromkeys(("starts", "kidnapping", "clusters", "particles"), "route")
     what = {**of_route, "dispersion": "weighting"}.get(table, table)
     what = "campus" if name == "campus" else what

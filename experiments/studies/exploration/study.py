@@ -50,7 +50,7 @@ def run(profile: Profile, out: Results, on_progress: Progress) -> None:
         out.write_arrays(f"drive_{strategy}", **drive_of(team.robots, settings.AFTER_M))
 
 
-REMADE = {"runs": 12.0, "coverage": 12.0}
+REMADE = {"runs": 5.0, "coverage": 5.0}
 
 
 def remake(_table: str, row: Row) -> Remake:

@@ -42,7 +42,7 @@ def run(profile: Profile, out: Results, on_progress: Progress) -> None:
     out.write_tables(**made, share=localised_share(made["starts"]))
 
 
-REMADE = {"starts": 20.0}  # the shares are means of them
+REMADE = {"starts": 15.0}  # the shares are means of them
 
 
 def remake(_table: str, row: Row) -> Remake:

@@ -46,7 +46,7 @@ def run(profile: Profile, out: Results, on_progress: Progress) -> None:
         out.write_tables(missing=named)
 
 
-REMADE = {"runs": 15.0}  # methods are means of them
+REMADE = {"runs": 8.0}  # methods are means of them
 
 
 def remake(_table: str, row: Row) -> Remake | None:

@@ -64,7 +64,7 @@ def run(profile: Profile, out: Results, on_progress: Progress) -> None:
     out.write_arrays("drive", **drive(settings.FIRST_SEED))
 
 
-REMADE = {"errors": 15.0, "mrclam": 120.0}
+REMADE = {"errors": 5.0, "mrclam": 120.0}
 
 
 def remake(table: str, row: Row) -> Remake | None:

@@ -194,8 +194,9 @@ def test_what_fails_or_is_not_here_is_said():
     }
     lines = summarize([good] * 98 + [behind], 4, given)
     assert lines[0] == "gil2008_laps, row 4: ate_rmse_m"
-    assert lines[1].startswith("left out: 1 table of means")
-    assert "4 rows of logs or programs not here" in lines[1]
+    n_laps, n_cost = (len(table) for table in given.values())
+    assert lines[1].startswith(f"left out: {100.0 * n_cost / (n_laps + n_cost):.1f} % of the rows")
+    assert lines[1].endswith("4 drawn rows of programs that are not here")
     assert lines[-1].startswith("98 of 99 rows equal, 1 of them behind headlines; of the 98 drawn")
     assert "at most 3 % of all rows can differ (95 %); different: ate_rmse_m (1)" in lines[-1]
 
