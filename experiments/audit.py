@@ -290,7 +290,7 @@ def summarize(found: Sequence[Finding], n_absent: int, tables: Judged) -> list[s
         lines.append(f"and {pluralize(len(bad) - _MOST_LINES, 'row')} more")
     here = np.concatenate([_are_here(tables, place) for place in tables])
     lines.append(
-        f"left out: {100.0 * np.mean(~here):.1f} % of the rows, which are means, times, drawings, or "
+        f"left out: {100.0 * np.mean(~here):.1f} % of the rows: means, times, drawings, and those "
         "of logs that are not here"
         + (f"; {pluralize(n_absent, 'drawn row')} of programs that are not here" * bool(n_absent))
     )
