@@ -69,7 +69,7 @@ def __getattr__(name: str) -> Any:
     return getattr(importlib.import_module(_TYPES[name]), name)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Run:
     """What an estimator made of a recording.
 
@@ -90,6 +90,32 @@ class Run:
     online: Estimate
     revised: Estimate | None
     row: Row
+
+    def __repr__(self) -> str:
+        row, prefix = self.row, "" if self.revised is None else "revised_"
+        numbers = {name: value for name, value in row.items() if isinstance(value, float)}
+        error_m, nees = numbers.get(f"{prefix}ate_rmse_m"), numbers.get(f"{prefix}nees_mean")
+        step_us = numbers.get("step_time_us")
+        facts = [
+            str(row["status"]) if row["status"] != "ok" else "",
+            "" if error_m is None else f"position RMSE {error_m * 1000.0:.3g} mm",
+            "" if nees is None else f"NEES {nees:.3g}",
+            "" if step_us is None else f"{step_us / 1000.0:.3g} ms a step",
+        ]
+        world = row.get("choice.world", "a recording")
+        return f"Run({row['choice.estimator']} on {world}: {', '.join(filter(None, facts))})"
+
+    def _repr_html_(self) -> str:
+        """Show the errors and the picture in a notebook."""
+        import base64
+        import html
+        import io
+
+        png = io.BytesIO()
+        self.plot().savefig(png, format="png")
+        picture = base64.b64encode(png.getvalue()).decode()
+        shown = html.escape(repr(self))
+        return f'<p>{shown}</p><img alt="{shown}" src="data:image/png;base64,{picture}">'
 
     def plot(self, path: str | Path | None = None) -> Figure:
         """Draw the trajectory, revised if there is one, and its errors against time.

@@ -108,7 +108,7 @@ class Belief:
     extras: dict[str, Any] = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Estimate:
     """A trajectory of beliefs.
 
@@ -143,6 +143,9 @@ class Estimate:
     extras: dict[str, list[Any]] = field(default_factory=dict)
     status: str = "ok"
     left_out: str = ""
+
+    def __repr__(self) -> str:
+        return f"Estimate({self.kind}, {len(self.means)} beliefs, {self.status})"
 
 
 Answer = tuple[Estimate, Estimate | None]  # of one robot: online and revised
@@ -225,20 +228,13 @@ def run(
     return journal.estimate()
 
 
-def run_and_finish(
-    estimator: Estimator,
-    recording: Recording,
-    prior: Prior,
-    rng: np.random.Generator,
-    keep: Collection[str] = (),
-    on_step: Callable[[int], None] | None = None,
-) -> Answer:
-    """Run an estimator as `run` does; its online estimate, and the revised one or None.
+def run_and_finish(estimator: Estimator, run_online: Callable[[], Estimate]) -> Answer:
+    """Online estimate of an estimator's run, and the revised one of `finish`, or None.
 
     The online one has the processor time of all, `finish` included, but for compiling code.
     """
     begun = processor_s()
-    online = run(estimator, recording, prior, rng, keep, on_step)
+    online = run_online()
     revised = finish(estimator, 1)
     own_s = processor_s() - begun
     spent_s = getattr(estimator, "program_seconds", own_s)  # without the transport to it

@@ -1,6 +1,7 @@
 """How a team's estimators run: what each knows of the other robots, and when."""
 
 import dataclasses
+import functools
 import itertools
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Literal
@@ -14,6 +15,7 @@ from estimators.base import (
     Journal,
     Prior,
     finish,
+    run,
     run_and_finish,
     share_processor_time,
     walk,
@@ -90,8 +92,9 @@ def run_team(
     tell = None if on_step is None else lambda _: on_step(next(count))
     if communication.kind == "never":
         return [
-            run_and_finish(make(), recording, prior, rng(number), on_step=tell)
-            for number, (recording, prior) in enumerate(zip(team.robots, priors, strict=True))
+            run_and_finish(one, functools.partial(run, one, *of_robot, rng(number), on_step=tell))
+            for number, of_robot in enumerate(zip(team.robots, priors, strict=True))
+            for one in [make()]
         ]
     begun, n = processor_s(), len(team)
     filters = [make() for _ in range(n if communication.kind == "range" else 1)]

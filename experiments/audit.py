@@ -32,7 +32,7 @@ from experiments.judging.remake import (
     rows_about,
 )
 from experiments.judging.results import Results
-from experiments.runs.console import pluralize, progress
+from experiments.runs.console import pluralize, progress, show
 from experiments.runs.paths import results
 from experiments.runs.row import Row
 from experiments.runs.version import describe_machine
@@ -106,8 +106,8 @@ def audit(minutes: float, n_rows: int | None, seed: int) -> bool:
     InputError
         If there are no judged tables, or a number is not positive.
     """
-    require(minutes > 0.0, f"--minutes must be positive, got {minutes:g}")
-    require(n_rows is None or n_rows > 0, f"--rows must be positive, got {n_rows}")
+    require(minutes > 0.0, f"minutes must be positive, got {minutes:g}")
+    require(n_rows is None or n_rows > 0, f"rows must be positive, got {n_rows}")
     tables = dict(_judged_tables())
     require(bool(tables), f"{results() / 'tables'}: no judged tables; run `make reproduce FULL=1`")
     budget_s = 60.0 * minutes * (os.cpu_count() or 1) if n_rows is None else np.inf
@@ -118,7 +118,7 @@ def audit(minutes: float, n_rows: int | None, seed: int) -> bool:
         made = list(in_parallel(make_again, jobs, on_progress, [each.cost_s for each in drawn]))
     both = zip(drawn, made, strict=True)
     found = [check(each, rows) for each, rows in both if rows is not None]
-    print("\n".join(summarize(found, len(made) - len(found), tables)))
+    show("\n".join(summarize(found, len(made) - len(found), tables)))
     return all(not finding.columns for finding in found)
 
 

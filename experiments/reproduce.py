@@ -3,7 +3,6 @@
 import os
 import re
 import shutil
-import sys
 import tempfile
 import time
 from collections import Counter
@@ -30,10 +29,10 @@ from experiments.judging.folders import LOGS, OWN, STUDIES, findings
 from experiments.judging.folders import part as _part
 from experiments.judging.jobs import in_parallel
 from experiments.judging.logs import why_missing
-from experiments.judging.results import Profile, Results
+from experiments.judging.results import Profile, Results, reproduce_command
 from experiments.judging.sentences import Conclusion, conclude
 from experiments.report.page import write_report
-from experiments.runs.console import pluralize, progress
+from experiments.runs.console import pluralize, progress, show, warn
 from experiments.runs.dependencies.recorder import recorded
 from experiments.runs.paths import results, short
 from experiments.viewing.style import save_figure
@@ -76,8 +75,8 @@ def check_results(minutes: float = 2.0) -> bool:
             )
             equal &= same
             said.append(f"{each.id} {each.verdict.label}" + " (not as judged)" * (not same))
-        print(f"{study}: {pluralize(n_figures, 'figure')}; {', '.join(said) or 'judges no claim'}")
-    print(f"{short(write_report(place))} has all of it; open it in a browser")
+        show(f"{study}: {pluralize(n_figures, 'figure')}; {', '.join(said) or 'judges no claim'}")
+    show(f"{short(write_report(place))} has all of it; open it in a browser")
     return equal
 
 
@@ -109,19 +108,19 @@ def reproduce(only: str | None = None) -> None:
     for paper in _chosen(only):
         begun = time.monotonic()
         if paper in LOGS and (why := why_missing()):
-            print(f"{paper}: left out, {why}", file=sys.stderr)
+            warn(f"{paper}: left out, {why}")
             continue
         conclusions = reproduce_paper(paper, Profile.FULL)
         for each in conclusions:
-            print(f"{each.id:<4} {each.verdict.label:<15} {first_sentence(each.sentence)}")
+            show(f"{each.id:<4} {each.verdict.label:<15} {first_sentence(each.sentence)}")
         counts = Counter(each.verdict for each in conclusions)
         ruled = ", ".join(
             f"{counts[verdict]} {verdict.label}" for verdict in Verdict if verdict in counts
         )
         lines.append(f"{paper}: {ruled or 'judges no claim'} ({time.monotonic() - begun:.0f} s)")
     page = write_report(results())
-    print("\n".join(["", *lines]))
-    print(f"{short(page)} has the figures and tables behind them; open it in a browser")
+    show("\n".join(["", *lines]))
+    show(f"{short(page)} has the figures and tables behind them; open it in a browser")
 
 
 def _check_claims() -> None:
@@ -143,17 +142,15 @@ def renew(only: str | None = None) -> None:
         if not own:
             continue
         if study in LOGS and (why := why_missing()):
-            print(
-                f"{study}: {pluralize(len(own), 'result')} stale, left out: {why}", file=sys.stderr
-            )
+            warn(f"{study}: {pluralize(len(own), 'result')} stale, left out: {why}")
             continue
-        print(f"{study}: {pluralize(len(own), 'result')} stale")
+        show(f"{study}: {pluralize(len(own), 'result')} stale")
         if any(each.name.startswith("tables/") for each in own):
             reproduce_paper(study, Profile.FULL)
         else:
             _renew_derived(study, own)
     if stale:
-        print(short(write_report(results())))
+        show(short(write_report(results())))
 
 
 def _renew_derived(study: str, stale: list[Built]) -> None:
@@ -180,22 +177,22 @@ def redraw(only: str | None = None) -> None:
     place = results()
     present = [p for p in _chosen(only) if any((place / "tables").glob(f"{p}_*.csv"))]
     if not present:
-        command = f"estima reproduce --full{f' --paper {only}' if only else ''}"
         raise InputError(
-            f"{short(place / 'tables')}: no tables of {only or 'any paper'}; run `{command}`"
+            f"{short(place / 'tables')}: no tables of {only or 'any paper'}; "
+            f"run `{reproduce_command(only)}`"
         )
     for paper in _chosen(only):
         begun = time.monotonic()
         if paper not in present:
-            print(f"{paper}: left out, no tables in {short(place)}", file=sys.stderr)
+            warn(f"{paper}: left out, no tables in {short(place)}")
             continue
         made = Results(place, paper)
         if paper in LOGS and only is None and not any((place / "arrays").glob(f"{paper}_*.npz")):
-            print(f"{paper}: left out, what it draws of the logs is not here", file=sys.stderr)
+            warn(f"{paper}: left out, what it draws of the logs is not here")
             continue
         with made.blaming_files():
             note_built(place, paper, _drawn_items(made))
-        print(f"{paper}: {time.monotonic() - begun:.0f} s", file=sys.stderr)
+        warn(f"{paper}: {time.monotonic() - begun:.0f} s")
 
 
 def reproduce_paper(paper: str, profile: Profile) -> list[Conclusion]:
@@ -252,7 +249,7 @@ def judgement(made: Results) -> tuple[list[Claim], list[Conclusion]]:
 def _write(
     claims: list[Claim], conclusions: list[Conclusion], place: Path, paper: str, profile: Profile
 ) -> None:
-    command = f"estima reproduce --paper {paper}{' --full' * (profile is Profile.FULL)}"
+    command = reproduce_command(paper)
     write_claims(claims, place / "claims.csv", paper=paper, profile=profile, command=command)
     says = findings(paper)["claims"]
     write_verdicts(conclusions, place / "verdicts.csv", paper=paper, says=says, profile=profile)
@@ -285,7 +282,7 @@ def _put_in_place(new: Path, old: Path, paper: str) -> None:
 
 def _chosen(only: str | None) -> tuple[str, ...]:
     if only is not None and only not in STUDIES:
-        raise InputError(f"--paper must be one of {', '.join(STUDIES)}, got {only!r}")
+        raise InputError(f"the paper must be one of {', '.join(STUDIES)}, got {only!r}")
     return STUDIES if only is None else (only,)
 
 

@@ -1,8 +1,9 @@
 """The one exception for input that a user can mend, and text that is safe to show."""
 
+import difflib
 import re
 import traceback
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeVar
@@ -32,6 +33,20 @@ class InputError(Exception):
 def printable(text: str) -> str:
     """Replace by ? what would control a terminal, and what XML 1.0 forbids."""
     return _UNPRINTABLE.sub("?", text)
+
+
+def describe_unknown(key: str, known: Iterable[str], where: str = "") -> str:
+    """Say that a key of a place is unknown, and which are known there, the nearest spelled first.
+
+    Examples
+    --------
+    >>> describe_unknown("sart", ["map", "start"], "prior")
+    'unknown key prior.sart; known: prior.start, prior.map'
+    """
+    names, place = list(known), f"{where}." if where else ""
+    near = difflib.get_close_matches(key, names, n=3)
+    listed = [f"{place}{name}" for name in dict.fromkeys([*near, *names])]
+    return f"unknown key {place}{key}; known: {', '.join(listed) or 'none'}"
 
 
 @contextmanager

@@ -36,7 +36,7 @@ from typing import (
 from pydantic import ConfigDict, Field, Strict, ValidationError
 from pydantic.dataclasses import dataclass as checked_dataclass
 
-from sim.errors import InputError, require
+from sim.errors import InputError, describe_unknown, require
 
 T = TypeVar("T")
 
@@ -117,10 +117,21 @@ def options(where: str) -> Callable[[type[T]], type[T]]:
         )
         del made.__signature__
         made.__init__ = checked
+        made.__setattr__ = _set_state
         made._place = where
         return cast("type[T]", made)
 
     return decorate
+
+
+def _set_state(self: Any, name: str, value: Any) -> None:
+    """Let a method keep a state, not change its options.
+
+    The dataclass's own goes through every class that is inherited: 4 us a value, in every step.
+    """
+    if name in type(self).__dataclass_fields__ or "_place" in vars(type(self)):
+        raise dataclasses.FrozenInstanceError(f"cannot assign to field {name!r}")
+    object.__setattr__(self, name, value)
 
 
 def build(cls: type[T], settings: Mapping[str, Any], where: str) -> T:
@@ -150,7 +161,8 @@ def build(cls: type[T], settings: Mapping[str, Any], where: str) -> T:
     values: dict[str, Any] = {}
     for key, value in settings.items():
         place = f"{where}.{key}"
-        require(key in fields, f"unknown key {place}; known: {', '.join(fields)}")
+        if key not in fields:
+            raise InputError(describe_unknown(key, fields, where))
         values[key] = _fitted(value, kinds[key], place, check=own is None)
     for name, f in fields.items():
         bare = f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING
@@ -277,7 +289,7 @@ def _complaint(cls: type, where: str, error: ValidationError) -> str:
     place = f"{where}.{name}" if where else name
     known = {option.name: option for option in described(cls)}
     if name not in known:
-        return f"unknown key {place}; known: {', '.join(known)}"
+        return describe_unknown(name, known, where)
     if first["type"] == "missing" and len(first["loc"]) == 1:
         return f"{place} is missing"
     wanted = known[name].accepts or first["msg"].removeprefix("Input should be ")

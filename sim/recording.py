@@ -63,7 +63,7 @@ SEVERAL = "it holds a team; run all of its robots by study=teams, or take one of
 S = TypeVar("S")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Truth:
     """What no Frame shows.
 
@@ -85,8 +85,11 @@ class Truth:
     readings: Mapping[str, Mapping[str, Values]] = field(default_factory=dict)
     world: World | None = None
 
+    def __repr__(self) -> str:
+        return f"Truth({len(self.stamps)} poses, {'a' if self.world else 'no'} map)"
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, repr=False)
 class Frame:
     """One instant at which a sensor fires, without the truth. Its arrays are read-only.
 
@@ -110,8 +113,11 @@ class Frame:
     readings: Mapping[str, Reading] = field(default_factory=dict)
     robot: int = 0
 
+    def __repr__(self) -> str:
+        return f"Frame({self.stamp:.6g} s: {', '.join(['wheels', *self.readings])})"
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, repr=False)
 class Recording:
     """A run: each sensor's data with its own stamps, the commands, the truth, where it came from.
 
@@ -146,6 +152,13 @@ class Recording:
     def __post_init__(self) -> None:
         for array in arrays_of(self).values():
             array.setflags(write=False)
+
+    def __repr__(self) -> str:
+        seen = ", ".join(f"{name} x {len(log.stamps)}" for name, log in self.logs.items())
+        return (
+            f"Recording({self.duration_s:.6g} s, {len(self.frame_stamps)} Frames; "
+            f"{seen or 'wheels alone'}; {self.truth or 'no truth'}; {self.status})"
+        )
 
     @property
     def duration_s(self) -> float:

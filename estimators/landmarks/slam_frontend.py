@@ -1,4 +1,4 @@
-"""What landmark SLAM does with an image before any filter: which observations, of which landmarks.
+"""From an image to observations and their landmarks, the same for every landmark filter.
 
 Shared by `estimators.landmarks.ekf_slam` and `estimators.landmarks.fastslam`, whose filters choose
 landmarks by distance themselves. `screened` also serves `estimators.graph.landmark_drive`.

@@ -162,7 +162,7 @@ def without_sparse_lines(scan: PreparedScan, max_gap_m: float) -> PreparedScan:
 
 @njit()
 def select(values: Array, rank: int) -> float:
-    """The value at a place of the sorted values, without sorting them.
+    """The value of a given rank, from the lowest, 0, found without sorting.
 
     `numpy.partition` does the same, but takes eleven seconds to compile.
     """

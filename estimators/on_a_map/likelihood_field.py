@@ -205,7 +205,7 @@ def beam_ends(ranges_m: Floats, laser: Laser, n_beams: int) -> Floats:
     """
     require(
         len(ranges_m) == laser.n_beams,
-        f"a scan of {len(ranges_m)} ranges, from a laser of {laser.n_beams} beams",
+        f"a scan of {len(ranges_m)} ranges from a laser of {laser.n_beams} beams",
     )
     ranges = np.asarray(ranges_m, float)
     seen = laser.returned(ranges)

@@ -64,7 +64,7 @@ class BinOptions:
     bin_m: Positive = 0.5
     """Side of the bins that KLD sampling counts, m."""
     bin_rad: Positive = 0.17
-    """Their size in heading, rad."""
+    """Width of the bins in heading, rad."""
 
 
 class Bins:
@@ -91,7 +91,7 @@ class Bins:
         self._shape: list[int] = shape.astype(int).tolist()
 
     def number(self, poses: Array) -> Ints:
-        """Number of the bin (M,) of each pose (M, 3); what lies off the map counts to its rim."""
+        """Number of the bin (M,) of each pose (M, 3); poses off the map go to bins at its edge."""
         columns, rows, n_headings = self._shape
         x, y = ((poses[:, i] - self._origin_m[i]) / self._believed.bin_m for i in (0, 1))
         heading = np.floor((poses[:, 2] + math.pi) / self._believed.bin_rad).astype(np.int64)

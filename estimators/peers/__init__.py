@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from estimators.base import Belief
 from sim.arrays import Array
 from sim.errors import InputError
 from sim.recording import Frame
@@ -45,6 +46,11 @@ def matrix_of(pose: Array) -> Array:
 def pose_of(T: Array) -> Array:
     """Planar pose (3,) of a homogeneous matrix (4, 4): its height, roll and pitch are dropped."""
     return np.array([T[0, 3], T[1, 3], np.arctan2(T[1, 0], T[0, 0])])
+
+
+def belief_of(pose: Array, status: str = "") -> Belief:
+    """Belief without a covariance, which these methods do not give."""
+    return Belief(pose.copy(), np.zeros((3, 3)), {"status": status} if status else {})
 
 
 def scan_of(frame: Frame, name: str, laser: Laser) -> Array | None:

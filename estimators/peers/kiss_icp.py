@@ -6,7 +6,7 @@ Vizzo et al., KISS-ICP: in defense of point-to-point ICP, RA-L 8(2), 2023. The w
 import numpy as np
 
 from estimators.base import Belief, LaserOptions, Prior
-from estimators.peers import package, pose_of, scan_of
+from estimators.peers import belief_of, package, pose_of, scan_of
 from sim import se2
 from sim.options import Count, Positive, options
 from sim.recording import Frame
@@ -69,4 +69,4 @@ class KissIcp(KissIcpOptions):
             self._pipeline.register_frame(cloud, np.zeros(len(points)))
             self._pose = se2.compose(self._start, pose_of(self._pipeline.last_pose))
         empty = points is not None and not len(points)
-        return Belief(self._pose.copy(), np.zeros((3, 3)), {"status": "empty"} if empty else {})
+        return belief_of(self._pose, "empty" if empty else "")

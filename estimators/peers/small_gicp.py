@@ -12,7 +12,7 @@ import numpy as np
 from estimators.base import Belief, LaserOptions, Prior
 from estimators.gaussian import STILL
 from estimators.laser.scan_matching import KeyFrameOptions, Reference
-from estimators.peers import matrix_of, package, pose_of, scan_of
+from estimators.peers import belief_of, matrix_of, package, pose_of, scan_of
 from sim import se2
 from sim.arrays import Array
 from sim.options import Count, Positive, options
@@ -76,7 +76,7 @@ class SmallGicp(SmallGicpOptions):
         guess = self._rolled if self.use_odometry_guess else self._motion
         if points is None:
             rolled = se2.compose(self._pose, self._rolled)
-            return _belief(rolled if self.use_odometry_guess else self._pose)
+            return belief_of(rolled if self.use_odometry_guess else self._pose)
         predicted = se2.compose(self._pose, guess)
         if len(points) < _LEAST_POINTS:
             return self._moved(predicted, "empty")
@@ -118,8 +118,4 @@ class SmallGicp(SmallGicpOptions):
     def _moved(self, pose: Array, status: str) -> Belief:
         self._motion = se2.between(self._pose, pose)
         self._pose, self._rolled = pose, STILL.mean
-        return _belief(pose, status)
-
-
-def _belief(pose: Array, status: str = "") -> Belief:
-    return Belief(pose.copy(), np.zeros((3, 3)), {"status": status} if status else {})
+        return belief_of(pose, status)

@@ -74,7 +74,7 @@ class OfflineOptions(ProgramOptions):
 
     @property
     def needs(self) -> frozenset[str]:
-        """What the named files are made of."""
+        """The sensors, and the map, from which the named files are made."""
         return frozenset(need for need, of in _NEEDED_BY.items() if self.places.intersection(of))
 
 

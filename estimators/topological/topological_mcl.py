@@ -58,7 +58,7 @@ class TopologicalMclOptions:
     weighting: Weighting = "M2"
     """M1, M2 or M3 of `node_log_weights` (maximo2024, eqs. (1)-(3))."""
     particles_per_node: Count = 4
-    """Particles, over the map's nodes; they face its neighbours in turn."""
+    """Particles per node of the map; they face its neighbours in turn."""
     n_nearest: Count = 5
     """B: how many of the map's most similar descriptors count."""
     sigma_l_m: Positive | None = None

@@ -37,7 +37,7 @@ def overrides(incomplete: str) -> list[str]:
 
 
 def options(group: str, config_dir: Path | None = None) -> list[str]:
-    """Options of a group of the configuration, and of a folder of further ones."""
+    """Options of a configuration group, including those of a further folder."""
     own = paths.option_names(group, config_dir) if config_dir else []
     return sorted({*paths.option_names(group), *own})
 

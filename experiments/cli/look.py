@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 from typing import Annotated
 
@@ -54,8 +55,29 @@ def options(
     if group is not None and name is not None:
         _describe(group, name, config_dir)
         return
-    for one in completion.GROUPS if group is None else (group,):
+    if group is not None:
+        names = completion.options(group, config_dir)
+        show(
+            "\n".join(f"{n:{max(map(len, names))}}  {_about(group, n, config_dir)}" for n in names)
+        )
+        return
+    for one in completion.GROUPS:
         print(f"{one:>10}: {', '.join(completion.options(one, config_dir))}")
+    print("Next: estima options GROUP says what each is, estima options NAME its keys.")
+
+
+def _file_of(group: str, name: str, config_dir: Path | None) -> Path:
+    """YAML of an option, the user's own first."""
+    files = (folder / group / f"{name}.yaml" for folder in (config_dir, paths.CONF) if folder)
+    return next(file for file in files if file.exists())
+
+
+def _about(group: str, name: str, config_dir: Path | None) -> str:
+    """What an option is: the first sentence of the comment at the head of its YAML."""
+    lines = _file_of(group, name, config_dir).read_text(encoding="utf-8").splitlines()
+    head = itertools.takewhile(lambda line: line.startswith("#"), lines)
+    words = " ".join(line.lstrip("# ") for line in head if "@package" not in line)
+    return words.partition(". ")[0].removesuffix(".")
 
 
 def _describe(group: str, name: str, config_dir: Path | None) -> None:
@@ -67,9 +89,7 @@ def _describe(group: str, name: str, config_dir: Path | None) -> None:
     known = f"no {group} named {name}; there are: {', '.join(names)}"
     require(name in names or group in _groups_of(name, config_dir), known)
     if group == "study":
-        files = (folder / group / f"{name}.yaml" for folder in (config_dir, paths.CONF) if folder)
-        path = next(file for file in files if file.exists())
-        show(path.read_text(encoding="utf-8").rstrip())
+        show(_file_of(group, name, config_dir).read_text(encoding="utf-8").rstrip())
     else:
         show(describe_option(group, name, searched(config_dir)))
 

@@ -52,18 +52,17 @@ def run(
         require(not many, f"-o {out}: one file holds one run; leave out -m")
         check_estimate_name(out)
     if many:
-        from experiments.report.of_sweep import after_sweep
-        from experiments.sweeps.launch import sweep_arguments
+        from experiments.cli.sweep import sweep_arguments
 
-        sweep_arguments([a for a in arguments if a not in many], after_sweep)
+        sweep_arguments([a for a in arguments if a not in many])
         return
     if not arguments:
         arguments = ["study=first_run"]
         print("estima run study=first_run (estima options lists what else there is)")
-    from experiments.runs.run import application
+    from experiments.cli.arguments import run_arguments
     from experiments.viewing.run_figure import draw_run
 
-    application(arguments, draw_run, out)
+    run_arguments(arguments, draw_run, out)
 
 
 def record(

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -20,21 +19,26 @@ class Matching:
     """How a trajectory meets the truth."""
 
     align: Annotated[
-        str, typer.Option("--align", help="Move it first: none, start (first pose), or se2.")
-    ] = "none"
+        str | None,
+        typer.Option("--align", help="Move it first: none (default), start (first pose), or se2."),
+    ] = None
     match: Annotated[
-        str,
+        str | None,
         typer.Option(
             "--match",
-            help="True poses: interpolated at its stamps, or nearest (as evo associates).",
+            help="True poses: interpolated at its stamps (default) or nearest (as evo associates).",
         ),
-    ] = "interpolated"
+    ] = None
     tolerance_s: Annotated[
-        float, typer.Option("--tolerance", help="Greatest difference of nearest stamps, s.")
-    ] = 0.01
+        float | None, typer.Option("--tolerance", help="Greatest difference of nearest stamps, s.")
+    ] = None
     offset_s: Annotated[
-        float, typer.Option("--offset", help="Added to the trajectory's stamps, s.")
-    ] = 0.0
+        float | None, typer.Option("--offset", help="Added to the trajectory's stamps, s.")
+    ] = None
+
+    def stated(self) -> dict[str, Any]:
+        """What is given; `Scoring` has the defaults."""
+        return {name: value for name, value in vars(self).items() if value is not None}
 
 
 @dataclass(frozen=True)
@@ -82,9 +86,7 @@ def score(
     """
     from experiments.runs.score import Scoring, as_text, score_files
 
-    how = Scoring(
-        **dataclasses.asdict(matching), revised=made.revised, cpu_seconds=made.cpu_seconds
-    )
+    how = Scoring(**matching.stated(), revised=made.revised, cpu_seconds=made.cpu_seconds)
     results = score_files(
         recording, trajectories, how, topic=made.topic, estimator=made.estimator, name=name
     )
@@ -121,7 +123,7 @@ def compare(
     from experiments.runs.score import Scoring
     from experiments.viewing.compare import compare_files
 
-    how = Scoring(**dataclasses.asdict(matching))
+    how = Scoring(**matching.stated())
     table = compare_files(trajectories, recording, out, how, topic)
     show(table.to_string(index=False, na_rep="-", float_format=lambda v: f"{v:.4g}"))
     print(out)

@@ -12,7 +12,7 @@ import typer
 from experiments.cli import completion
 from experiments.cli.flags import ConfigDir, Sweep, gathered
 from experiments.runs.console import show
-from sim.errors import require
+from sim.errors import InputError, require
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -167,9 +167,11 @@ def plot(
     from experiments.report import of_sweep
 
     panels = of_sweep.Panels(axes.x, axes.y, axes.by or [], axes.row, axes.col, size, pool)
-    chosen = of_sweep.plot_of(_rows(name, kept, times=True), name, panels, out)
-    if chosen:
-        print(chosen, file=sys.stderr)
+    drawn = of_sweep.plot_of(_rows(name, kept, times=True), name, panels, out)
+    if drawn != panels:
+        words = [f"--x {drawn.x}", *(f"--by {each}" for each in drawn.by)]
+        words += [f"--col {drawn.col}"] if drawn.col else []
+        print(f"drawn with {' '.join(words)}", file=sys.stderr)
     print(out)
 
 
@@ -240,4 +242,11 @@ def export_table(
     """
     from experiments.report.export import export
 
-    export(tables, form, out, digits)
+    for text in export(tables, form, out, digits):
+        try:
+            print(text)
+        except UnicodeEncodeError as error:
+            raise InputError(
+                f"the output's encoding, {error.encoding}, lacks {text[error.start]!a} of the "
+                "tables; write files, or set PYTHONIOENCODING=utf-8"
+            ) from error

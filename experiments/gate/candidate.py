@@ -1,7 +1,6 @@
 """Trajectories made elsewhere over the recordings of a suite, as rows that a check compares."""
 
 import importlib.util
-import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ import pandas as pd
 from estimators.programs.offline import recording_of, start_text
 from experiments.evaluation.metrics import path_scores
 from experiments.gate.suite import ERRORS, Entry, Suite, fingerprint, read_suite, suite_path
-from experiments.runs.console import progress
+from experiments.runs.console import progress, warn
 from experiments.runs.experiment import Experiment
 from experiments.runs.score import Scoring, match_and_align
 from experiments.trajectories.read import SUFFIXES, read_trajectory
@@ -106,7 +105,7 @@ def _tell_of_others(folder: Path, read: set[Path | None]) -> None:
     if others:
         more = f" and {len(others) - 5} more" if len(others) > 5 else ""
         shown = printable(", ".join(others[:5]))
-        print(f"{folder}: of no run, left out: {shown}{more}", file=sys.stderr)
+        warn(f"{folder}: of no run, left out: {shown}{more}")
 
 
 def trajectory_path(folder: Path, entry: Entry, seed: int, repeat: int) -> Path | None:
@@ -138,5 +137,5 @@ def _recordings(suite: Suite, group: str) -> Iterator[tuple[int, Experiment, Tea
     whole = Experiment.compose(suite.overrides[group])
     for i in range(suite.counts[group]):
         seed = suite.first_seed + i
-        experiment = whole.replace(seed=seed, world_seed=seed)
+        experiment = whole.with_values(seed=seed, world_seed=seed)
         yield seed, experiment, experiment.recordings()

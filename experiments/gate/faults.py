@@ -132,7 +132,7 @@ def _reading(frame: Frame, name: str, reading: Reading | None) -> Frame:
 
 @in_argument_of("step")
 def wrong_travel(frame: Frame, share: float, _: np.random.Generator) -> Frame:
-    """The wheels' travel is believed too long, as by a wrong radius."""
+    """Wheel travel is overestimated, as with a wrong radius."""
     return dataclasses.replace(frame, wheel_increments_m=(1.0 + share) * frame.wheel_increments_m)
 
 

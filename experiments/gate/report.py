@@ -3,7 +3,6 @@
 import math
 import os
 import shlex
-import sys
 import tempfile
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Mapping, Sequence
@@ -16,7 +15,7 @@ from experiments.gate.compare import Change, Finding
 from experiments.gate.suite import command_of, draw_run, read_suite, suite_path
 from experiments.report.export import escape_markdown, to_markdown
 from experiments.runs.columns import COLUMNS
-from experiments.runs.console import progress, show
+from experiments.runs.console import progress, show, warn
 from experiments.runs.paths import results, short
 from sim.errors import InputError, printable, require
 from sim.files import write_text
@@ -47,12 +46,12 @@ def run_check(
             )
         show(as_text(accepted.findings, hint=""))
         for path in accepted.written:
-            print(f"accepted: {short(path)}")
+            show(f"accepted: {short(path)}")
         for path in accepted.copied:
-            print(f"copied, unchanged: {short(path)}")
+            show(f"copied, unchanged: {short(path)}")
         left = [f for f in accepted.findings if f.alarms and f.baseline == "release"]
         if left and not release:
-            print(
+            show(
                 "worse than the release baseline, and checks will say so until you pin it again: "
                 f'estima check{_options(suite, left)} --accept "REASON" --release'
             )
@@ -66,10 +65,9 @@ def run_check(
     detectable = smallest_found() if is_main(suite) else {}
     paths = baseline_paths(suite)
     if paths["accepted"].exists() and not paths["release"].exists():
-        print(
+        warn(
             f"estima: {paths['release']}: no release baseline, so small steps can add "
-            "up unseen; pin one with --accept REASON --release",
-            file=sys.stderr,
+            "up unseen; pin one with --accept REASON --release"
         )
     with progress("checking the estimators", 1.0) as on_progress:
         findings = check(suite, only, on_progress, candidate)

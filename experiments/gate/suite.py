@@ -230,7 +230,9 @@ def run_suite(
         runs = [
             (
                 entry,
-                Experiment.compose(_overrides(suite, entry)).replace(repeats=repeats[entry.name]),
+                Experiment.compose(_overrides(suite, entry)).with_values(
+                    repeats=repeats[entry.name]
+                ),
                 (planted or {}).get(entry.name),
             )
             for entry in suite.estimators
@@ -257,7 +259,7 @@ def draw_run(suite: Suite, estimator: str, recording: int, path: Path) -> bool:
         estimates.append((read, revised if entry.revised and revised is not None else online))
 
     (row, *_) = evaluate(
-        Experiment.compose(_overrides(suite, entry, recording)).replace(repeats=1),
+        Experiment.compose(_overrides(suite, entry, recording)).with_values(repeats=1),
         streams=partial(_stream, f"estimator/{estimator}", recording, 0),
         on_estimate=keep,
     )
@@ -284,11 +286,11 @@ def _run_recording(
 ) -> list[dict[str, Any]]:
     """Rows of all runs over one recording."""
     rows = []
-    recording = runs[0][1].replace(seed=seed, world_seed=seed).recordings()
+    recording = runs[0][1].with_values(seed=seed, world_seed=seed).recordings()
     origin = {"checksum": recording.checksum[:12], "fingerprint": fingerprint(recording)}
     for entry, experiment, planted in runs:
         for row in evaluate(
-            experiment.replace(seed=seed, world_seed=seed),
+            experiment.with_values(seed=seed, world_seed=seed),
             lambda: recording,
             streams=partial(_stream, f"estimator/{entry.name}", seed, reseed),
             planted=planted and partial(_plant, planted, seed, reseed),

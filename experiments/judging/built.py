@@ -163,13 +163,13 @@ def this_commit() -> str:
     try:
         said = [
             subprocess.run(["git", *words], cwd=SOURCE, capture_output=True, text=True, check=True)
-            for words in (["rev-parse", "--short=10", "HEAD"], ["status", "--porcelain", "-uno"])
+            for words in (["rev-parse", "HEAD"], ["status", "-s", "-uno"])
         ]
     except (OSError, subprocess.CalledProcessError):
         return "?"
     commit, files = (each.stdout.strip() for each in said)
     edited = [line for line in files.splitlines() if " results/" not in f" {line}"]
-    return commit + "+" * bool(edited)
+    return commit[:10] + "+" * bool(edited)
 
 
 def _read(results: Path) -> dict[str, Any]:

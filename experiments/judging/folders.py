@@ -34,11 +34,12 @@ def part(study: str, name: str) -> ModuleType:
 def findings(study: str) -> dict[str, Any]:
     """A study's findings in our words.
 
-    They are its `title`, `about`, `claims` and `sentences` by id, those claims that are our `own`
-    rather than the paper's, the `unit` that intervals narrow
-    with, and `figures` by file name.
+    They are its `title`, the paper's `source` and `doi`, `about`, `claims` and `sentences` by id,
+    those claims that are our `own` rather than the paper's, the `unit` that intervals narrow with,
+    and `figures` by file name.
     """
     path = code_folder(study) / "findings.yaml"
     found = read_yaml(path) if path.exists() else {}
-    empty = {"title": study, "about": "", "claims": {}, "own": [], "sentences": {}, "figures": {}}
+    empty = {"title": study, "claims": {}, "own": [], "sentences": {}, "figures": {}}
+    empty |= dict.fromkeys(("about", "source", "doi"), "")
     return {**empty, **found}

@@ -77,7 +77,7 @@ def freiburg() -> Recording:
 def landmarks(robot: int, calibrated: bool, identifies: bool) -> Recording:
     """One robot of MRCLAM 6, with ranges and bearings to landmarks."""
     logged = mrclam.read_mrclam(MRCLAM_6, robot, identifies)
-    return calibrate_by_truth(logged).apply(logged) if calibrated else logged
+    return calibrate_by_truth(logged).apply_to(logged) if calibrated else logged
 
 
 def wean_hall(number: int) -> Recording:

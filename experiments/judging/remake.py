@@ -29,6 +29,7 @@ _TIMES = re.compile(
 )
 
 
+Cells = dict[str, Any]  # a row of a file, by column
 Remake = tuple[Callable[..., Tables], tuple[Any, ...]]  # a call that makes a row, among others
 
 

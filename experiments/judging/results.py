@@ -125,7 +125,12 @@ class Results:
 
     @property
     def _remedy(self) -> str:
-        return f"run `estima reproduce --full --paper {self.paper}`"
+        return f"run `{reproduce_command(self.paper)}`"
+
+
+def reproduce_command(paper: str | None) -> str:
+    """The command that makes a paper's results again, or those of all papers."""
+    return f"estima reproduce{f' --paper {paper}' if paper else ''} --full"
 
 
 class _Arrays(Arrays):

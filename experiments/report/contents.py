@@ -16,7 +16,7 @@ from PIL import Image, UnidentifiedImageError
 from experiments.judging.claim import Role, Verdict, headline_verdict
 from experiments.judging.claims_file import read_claims, read_provenance, read_verdicts, this_code
 from experiments.judging.folders import code_folder, findings
-from experiments.judging.results import Profile
+from experiments.judging.results import Profile, reproduce_command
 from experiments.report.export import as_text, fold_intervals, numeric_columns, plain
 from experiments.report.leaderboard import by_world, on_lasers
 from experiments.runs.paths import CONF
@@ -40,12 +40,12 @@ OWN = {
     ],
     "peers": [
         "pip install 'estima[peers,tune]' && make peers",
-        "estima reproduce --paper peers --full",
+        reproduce_command("peers"),
         "estima tune peers -o conf/estimator",
     ],
     "all_estimators": ["estima run -m study=all_estimators"],
-    "mcl_office": ["estima reproduce --paper mcl_office --full"],
-    "fastslam_consistency": ["estima reproduce --paper fastslam_consistency --full"],
+    "mcl_office": [reproduce_command("mcl_office")],
+    "fastslam_consistency": [reproduce_command("fastslam_consistency")],
 }
 FIRST = (
     "real_logs_building",
@@ -64,7 +64,7 @@ def contents(results: Path, on_progress: Callable[[float], None]) -> dict[str, A
     about = {name: findings(name) for name in (*papers, *OWN)}
     sentences = read_verdicts(results / "verdicts.csv").set_index("id")["sentence"].to_dict()
     claims = judged_claims(table, about, sentences)
-    commands = {name: [f"estima reproduce --full --paper {name}"] for name in papers} | OWN
+    commands = {name: [reproduce_command(name)] for name in papers} | OWN
     commands |= {str(k): list(v.unique()) for k, v in table.groupby("paper")["command"]}
     studies = {}
     for done, (name, page) in enumerate(about.items(), start=1):
@@ -87,8 +87,6 @@ def contents(results: Path, on_progress: Callable[[float], None]) -> dict[str, A
         "claims": claims,
         "by_world": by_world(results / "tables" / "leaderboard_means.csv"),
         "first": next((pictures[name] for name in FIRST if name in pictures), None),
-        "titles": {name: page["title"] for name, page in about.items()},
-        "holds_best": papers_holding_best({name: studies[name]["tally"] for name in PAPERS}),
         "on_lasers": on_lasers(results / "tables" / "peers_methods.csv"),
         "n_statistics": len(table),
         "n_judged": table["id"].nunique(),
@@ -108,19 +106,6 @@ def contents(results: Path, on_progress: Callable[[float], None]) -> dict[str, A
         "details": list(dict.fromkeys(key for how in origins.values() for key in how)),
         "unknown": [paper for paper in papers if paper not in made],
     }
-
-
-def papers_holding_best(
-    tallies: Mapping[str, Sequence[tuple[Verdict, int]]],
-) -> list[tuple[str, int, int]]:
-    """The papers of the greatest share of reproduced claims, with their number and that of all."""
-    papers = [
-        (name, dict(counts).get(Verdict.REPRODUCED, 0), sum(n for _, n in counts))
-        for name, counts in tallies.items()
-        if counts
-    ]
-    best = max((held / n for _, held, n in papers), default=0.0)
-    return [entry for entry in papers if best and entry[1] / entry[2] == best]
 
 
 def tally(claims: Iterable[Entry]) -> list[tuple[Verdict, int]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import textwrap
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -272,8 +272,8 @@ FORMATS: dict[str, tuple[Callable[[pd.DataFrame, int], str], str]] = {
 }
 
 
-def export(paths: Sequence[Path], form: str, out: Path | None, digits: int) -> None:
-    """Run `estima export-table`: print tables, or write them to the folder `out`.
+def export(paths: Sequence[Path], form: str, out: Path | None, digits: int) -> Iterator[str]:
+    """Tables as text; or, once they are written to the folder `out`, how many they are.
 
     Raises
     ------
@@ -292,13 +292,7 @@ def export(paths: Sequence[Path], form: str, out: Path | None, digits: int) -> N
         text = as_form(fold_intervals(read_table(path)), digits)
         if out is not None:
             write_text(out / f"{path.stem}{suffix}", text)
-            continue
-        try:
-            print(text)
-        except UnicodeEncodeError as error:
-            raise InputError(
-                f"{path}: the output's encoding, {error.encoding}, lacks {text[error.start]!a}; "
-                "write files, or set PYTHONIOENCODING=utf-8"
-            ) from error
+        else:
+            yield text
     if out is not None:
-        print(f"{out}: {len(paths)} tables")
+        yield f"{out}: {len(paths)} tables"

@@ -2,52 +2,26 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pandas as pd
 
+from experiments.judging.results import reproduce_command
 from experiments.report.page import write_report
 from experiments.report.plot import Size, sweep_figure
 from experiments.report.sweep_page import extremes, picture_path, write_sweep_page
 from experiments.report.table import as_lines, notes, statuses, write_table
 from experiments.runs import paths
-from experiments.runs.console import pluralize, progress, show
+from experiments.runs.console import pluralize, progress, show, warn
 from experiments.runs.row import Outcome, write_frame
 from experiments.sweeps.again import draw_recorded_run, short_key
-from experiments.sweeps.collect import collect, folder_of, suggest_axes
-from experiments.sweeps.summary import ERROR, summary
+from experiments.sweeps.collect import folder_of, suggest_axes
+from experiments.sweeps.summary import summary
 from experiments.viewing.play import Showing
 from experiments.viewing.style import save_figure
 from sim.errors import InputError, require
-
-_FEW_RUNS, _FEW_LINES = 2000, 30
-
-
-def after_sweep(folder: Path, n_runs: int) -> None:
-    """Print a sweep's small table, and what can be done next."""
-    against = ""
-    if n_runs <= _FEW_RUNS:
-        rows = collect(str(folder))
-        if (rows["status"] == Outcome.FAILED).all():
-            (why, count), *_ = statuses(rows)
-            reason = why.removeprefix("failed: ")
-            often = f"All {len(rows)} runs failed, most often ({count}) so"
-            show(f"{often if len(rows) > 1 else 'The run failed'}: {reason}")
-            print(f"\nNext: estima table {folder.name} --rows -o rows.csv  (how each run ended)")
-            return
-        means = summary(rows, metrics=[ERROR] if "ate_rmse_m" in rows else [])
-        if len(means) <= _FEW_LINES:
-            show(as_lines(means, notes(means, None)))
-        estimators = rows.loc[rows["status"] != Outcome.FAILED, "choice.estimator"].unique()
-        against = f" --against {estimators[0]}" if len(estimators) > 1 else ""
-    name = folder.name
-    print(
-        f"\nNext: estima table {name}{against} -o table.tex\n      estima plot {name}\n"
-        f"      estima report {name}"
-    )
 
 
 def write_rows(rows: pd.DataFrame, out: Path) -> str:
@@ -89,28 +63,24 @@ class Panels:
     pool: bool
 
 
-def plot_of(rows: pd.DataFrame, name: str, panels: Panels, out: Path) -> str:
-    """Draw a sweep's chart into a file; return what was chosen, if it was."""
+def plot_of(rows: pd.DataFrame, name: str, panels: Panels, out: Path) -> Panels:
+    """Draw a sweep's chart into a file; return what it shows."""
     require(panels.size in list(Size), f"the size must be {', '.join(Size)}, got {panels.size}")
     failed = rows["status"] == Outcome.FAILED
     if failed.all():
         every = f"all {len(rows)} runs" if len(rows) > 1 else "the run"
         raise InputError(f"{name}: {every} failed; `estima table {name}` says how")
     if failed.any():
-        print(f"{failed.sum()} of {len(rows)} runs failed; left out", file=sys.stderr)
+        warn(f"{failed.sum()} of {len(rows)} runs failed; left out")
         rows = rows[~failed]
-    chosen = ""
     if panels.x is None:
         taken = [each for each in (*panels.by, panels.row, panels.col) if each]
         x, *others = suggest_axes(rows, taken)
         panels = replace(panels, x=x)
         if not taken:
             panels = replace(panels, by=others[:1], col=next(iter(others[1:]), None))
-        words = [f"--x {x}", *(f"--by {each}" for each in panels.by)]
-        words += [f"--col {panels.col}"] if panels.col else []
-        chosen = f"drawn with {' '.join(words)}"
     save_figure(sweep_figure(rows, **vars(panels)), out)
-    return chosen
+    return panels
 
 
 def page_of(
@@ -132,7 +102,7 @@ def page_of_papers() -> Path:
     require(
         any((results / name).exists() for name in ("claims.csv", "figures", "tables")),
         f"{paths.short(results)}: no claims, figures or tables to report; "
-        "`estima reproduce --full` makes them, and `estima table NAME` shows a sweep",
+        f"`{reproduce_command(None)}` makes them, and `estima table NAME` shows a sweep",
     )
     with progress("report", 1.0) as on_progress:
         return write_report(results, on_progress)
@@ -155,4 +125,4 @@ def _draw_extremes(
                 )
             )
         except InputError as error:
-            print(f"{out.name} is not drawn: {error}", file=sys.stderr)
+            warn(f"{out.name} is not drawn: {error}")

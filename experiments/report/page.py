@@ -7,7 +7,6 @@ import base64
 import hashlib
 import math
 import re
-import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -15,9 +14,10 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 
-from experiments.judging.results import Profile
+from experiments.judging.results import Profile, reproduce_command
 from experiments.report.contents import contents
 from experiments.report.export import plain, significant
+from experiments.runs.console import warn
 from sim.errors import printable
 from sim.files import write_text
 
@@ -36,10 +36,9 @@ def write_report(results: Path, on_progress: Callable[[float], None] = lambda _:
     """
     found = contents(results, on_progress)
     if found["missing"]:
-        print(
+        warn(
             f"{results / 'claims.csv'}: no verdict on {', '.join(found['missing'])}, though others "
-            "of the paper have one; `git checkout results/claims.csv` or `estima reproduce --full`",
-            file=sys.stderr,
+            f"of the paper have one; `git checkout results/claims.csv` or `{reproduce_command(None)}`"
         )
     path = results / "report.html"
     write_text(path, render("page.html", **found))

@@ -23,18 +23,18 @@ from experiments.report.table import DIGITS, HTML, WORDS, notes, shown, statuses
 from experiments.runs.columns import ANSWER, COLUMNS, PATH, REPEAT, REVISED, average_of, is_setting
 from experiments.runs.columns import title as titled
 from experiments.runs.row import Outcome
-from experiments.sweeps.again import noted_config_dir, short_key
+from experiments.sweeps.again import short_key
 from experiments.sweeps.averages import RECORDING, rule
 from experiments.sweeps.collect import (
     DRAWN,
     FEW,
-    commands,
     distinguishing_settings,
     result_columns,
     suggest_axes,
     unfinished_sweeps,
     with_answers,
 )
+from experiments.sweeps.commands import commands, config_dir_option, noted_config_dir
 from experiments.sweeps.summary import ERROR, summary
 from sim.errors import printable, require
 from sim.files import write_text
@@ -85,8 +85,8 @@ def write_sweep_page(
         path.stem: quote(path.relative_to(out.parent).as_posix())
         for path in _pictures(out).glob("*.html")
     }
-    own = config_dir or noted_config_dir(folder)
-    options = f" --config-dir {shlex.quote(str(own))}" if own else ""
+    given = config_dir_option(config_dir or noted_config_dir(folder))
+    options = f" {shlex.join(given)}" if given else ""
     runs = extremes(table)
     found = summary(table)
     means = written(shown(found), HTML, DIGITS)

@@ -6,7 +6,6 @@ most $ESTIMA_CACHE_GIB (8 unless set); the least recently used go first.
 
 import dataclasses
 import os
-import sys
 import time
 import zlib
 from collections.abc import Callable
@@ -14,6 +13,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from experiments.runs import paths
+from experiments.runs.console import warn
 from experiments.runs.dependencies.digests import changed
 from experiments.runs.dependencies.recorder import Digests, note
 from experiments.runs.processes import hold_lock
@@ -56,7 +56,7 @@ def fetch_or_make(key: str, make: Callable[[], tuple[Recording, Digests]]) -> Re
                     return recording
                 path.unlink(missing_ok=True)
             except InputError as error:
-                print(f"estima: {error}; making it again", file=sys.stderr)
+                warn(f"estima: {error}; making it again")
                 path.unlink(missing_ok=True)
         recording, dependencies = make()
         note(dependencies)

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import yaml
 from pydantic import Field
 
-from sim.errors import InputError, require
+from sim.errors import InputError, describe_unknown, require
 from sim.files import write_text
 from sim.formats.assemble import frame_stamps
 from sim.options import NonNegative, Positive, build, options
@@ -85,7 +85,7 @@ class Calibration:
     slip: Slip
     sensors: Mapping[str, SensorBelief] = field(default_factory=dict)
 
-    def apply(self, recording: Recording) -> Recording:
+    def apply_to(self, recording: Recording) -> Recording:
         """Return the recording with the log's values replaced by the calibrated ones.
 
         Raises
@@ -154,9 +154,9 @@ def read_calibration(path: Path) -> Calibration:
         isinstance(document, dict) and {"wheels", "slip"} <= document.keys(),
         f"{path}: a calibration holds wheels, slip and sensors; make one with `estima calibrate`",
     )
-    known = {"wheels", "slip", "sensors", "intervals"}
-    unknown = ", ".join(sorted(map(str, document.keys() - known)))
-    require(not unknown, f"{path}: unknown key {unknown}; known: {', '.join(sorted(known))}")
+    known = ("wheels", "slip", "sensors", "intervals")
+    for key in document:
+        require(key in known, f"{path}: {describe_unknown(str(key), known)}")
     sensors = document.get("sensors") or {}
     require(isinstance(sensors, dict), f"{path}: sensors must hold the sensors' names")
     try:

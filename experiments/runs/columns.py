@@ -124,7 +124,7 @@ COLUMNS = {
     **_OF_THE_PATH,
     **_OF_THE_MAP,
     **_of(REVISED, ", revised path", " revised"),
-    **_of(ANSWER, ", best answer", ""),
+    **_of(ANSWER, "", ""),
 }
 STATUS = ("status", "status_code", "status_detail")
 REPEAT = "repeat"  # counts the runs of an estimator over one recording

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import functools
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -26,13 +25,12 @@ from experiments.runs.schema import (
     KEYS,
     Config,
     check_shape,
-    describe_unknown,
     describe_unknown_key,
     fill,
     leaves,
-    select,
+    value_at,
 )
-from sim.errors import InputError, require
+from sim.errors import InputError, describe_unknown, require
 from sim.files import write_text
 from sim.yaml_file import read_yaml
 
@@ -42,7 +40,7 @@ _REMEDIES = {  # by the beginning of a setting that nothing reads
     "from Python",
     "hydra.sweeper": "give the values themselves, such as seed=1,2",
     "hydra.verbose": "nothing is logged; a failed run's row says how",
-    "": "rows go to results/runs/NAME: set name, or --results for another folder",
+    "": "rows go to results/runs/NAME: set name, or ESTIMA_RESULTS for another folder",
 }
 
 
@@ -144,7 +142,7 @@ class Composer:
                 set_value(cfg, override.key_or_group, override.value())
             fill(cfg)
             for override in options:
-                deleted = override.is_delete() and select(cfg, override.key_or_group) is not None
+                deleted = override.is_delete() and value_at(cfg, override.key_or_group) is not None
                 require(
                     not deleted,
                     f"{override.input_line}: {override.key_or_group} cannot be left out; set it",
@@ -168,50 +166,6 @@ def open_composer(extra: Sequence[str] = ()) -> Iterator[Composer]:
     """Yield a composer of the project's configuration."""
     with initialize_config_dir(str(paths.CONF), version_base="1.3"):
         yield Composer(extra)
-
-
-@dataclass(frozen=True)
-class CommandLine:
-    """Arguments of `estima run`.
-
-    Attributes
-    ----------
-    overrides
-        Hydra's.
-    config_dir
-        A further folder of options.
-    shown
-        Whether the configuration is printed, rather than run.
-    resolved
-        Whether it is printed with values in place of interpolations.
-    """
-
-    overrides: Sequence[str]
-    config_dir: str | None
-    shown: bool
-    resolved: bool
-
-    @classmethod
-    def of(cls, arguments: Sequence[str]) -> CommandLine:
-        """Read overrides and options, in any order.
-
-        Raises
-        ------
-        InputError
-            If an option is unknown, or lacks its value.
-        """
-        parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
-        parser.add_argument("overrides", nargs="*")
-        parser.add_argument("--config-dir", "-cd")
-        parser.add_argument("--cfg", "-c", choices=["job"])
-        parser.add_argument("--resolve", action="store_true")
-        known = "estima run takes overrides, -m, --config-dir FOLDER, --cfg job and --resolve"
-        try:
-            given, others = parser.parse_known_intermixed_args(arguments)
-        except argparse.ArgumentError as error:
-            raise InputError(f"{error}; {known}") from error
-        require(not others, f"{' '.join(others)}: {known}")
-        return cls(given.overrides, given.config_dir, given.cfg is not None, given.resolve)
 
 
 def find_option(group: str, name: str, config_dir: str | Path | None = None) -> str:
@@ -242,7 +196,7 @@ def set_value(cfg: DictConfig, key: str, value: Any) -> None:
         If it has none of that name.
     """
     parent, _, leaf = key.rpartition(".")
-    node = select(cfg, parent) if parent else cfg
+    node = value_at(cfg, parent) if parent else cfg
     names: Collection[Any] = node.keys() if isinstance(node, DictConfig) else ()
     if isinstance(node, ListConfig):
         names = [str(place) for place in range(len(node))]
@@ -280,7 +234,7 @@ def searched(config_dir: str | Path | None) -> list[str]:
     if config_dir is None:
         return []
     folder = Path(config_dir).resolve()
-    require(folder.is_dir(), f"--config-dir must name a folder, got {config_dir}")
+    require(folder.is_dir(), f"{config_dir}: no such folder of options")
     require("${" not in str(folder), f"{folder}: Hydra takes ${{ for a value; rename the folder")
     for group in (*GROUPS, "study"):
         for path in sorted((folder / group).rglob("*.yaml")):
@@ -360,31 +314,24 @@ def _check_added(overrides: Sequence[Override], groups: Collection[str]) -> None
             require(key in KEYS or override.key_or_group in groups, describe_unknown(key, KEYS))
 
 
-def check_hydra(overrides: Sequence[str]) -> None:
-    """Check that no override is one of Hydra's own settings that nothing here reads.
+def check_overrides(overrides: Sequence[str]) -> None:
+    """Check what Hydra itself does not.
+
+    Each override has a key, groups have names, and of Hydra's own settings there are only those
+    that are read here.
 
     Raises
     ------
     InputError
-        Naming what to do instead.
+        Naming the override, and what to do instead.
     """
-    for override in overrides:
-        key = override.lstrip("+~").partition("=")[0]
-        remedy = next(text for start, text in _REMEDIES.items() if key.startswith(start))
+    for text in overrides:
+        key = text.lstrip("+~").partition("=")[0]
+        remedy = next(said for start, said in _REMEDIES.items() if key.startswith(start))
         require(
             re.match(r"hydra\b", key) is None or key.startswith(_READ_OF_HYDRA),
-            f"{override}: {key} has no effect here; {remedy}",
+            f"{text}: {key} has no effect here; {remedy}",
         )
-
-
-def check_overrides(overrides: Sequence[str]) -> None:
-    """Check what Hydra itself does not: that each override has a key, and groups have names.
-
-    Raises
-    ------
-    InputError
-        Naming the override.
-    """
     for override in OverridesParser.create().parse_overrides(list(overrides)):
         key, value = override.key_or_group, override.value()
         require(key, f"{override.input_line}: no key before the =")

@@ -175,6 +175,11 @@ def show(text: str) -> None:
     _write("\n".join(map(printable, text.split("\n"))), sys.stdout)
 
 
+def warn(text: str) -> None:
+    """Print text to the error stream, as `show` prints to the output."""
+    _write("\n".join(map(printable, text.split("\n"))), sys.stderr)
+
+
 def _say(message: str, code: int) -> NoReturn:
     _write(printable(" ".join(f"estima: {message}".splitlines())), sys.stderr)
     sys.exit(code)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import ThreadpoolController
 
-from estimators.base import Answer, Estimate, Estimator, Prior, run_and_finish
+from estimators.base import Answer, Estimate, Estimator, Prior, run, run_and_finish
 from estimators.team import run_team
 from experiments.evaluation.map_quality import landmark_errors
 from experiments.evaluation.metrics import (
@@ -167,7 +167,9 @@ def run_over(
     and the matrices of filters are small.
     """
     with limit_blas():
-        return run_and_finish(estimator, recording, prior, rng, keep, on_step)
+        return run_and_finish(
+            estimator, lambda: run(estimator, recording, prior, rng, keep, on_step)
+        )
 
 
 def limit_blas() -> AbstractContextManager[object]:
@@ -298,7 +300,7 @@ def status_of_team(statuses: Sequence[Status]) -> Status:
 
 
 def scores_of_team(team: Team, scores: Sequence[Row]) -> Row:
-    """The one row of a team's run, of the scores of its robots.
+    """Scores of a team: those of its robots, combined.
 
     Errors are pooled by their squares over all stamps that count. Counts and times of a step add
     up; all else is averaged over the stamps. `worst_robot_rmse_m` comes from the best answers.

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import inspect
-import json
 import operator
 import re
 from collections.abc import Iterable, Sequence
@@ -16,9 +15,8 @@ from omegaconf import OmegaConf
 
 from estimators.base import Estimator
 from experiments.runs import paths
-from experiments.runs.columns import DEPENDENCIES
 from experiments.runs.compose import name_study_files, open_composer
-from experiments.runs.key import effective_config, run_key
+from experiments.runs.key import origin_columns, run_key
 from experiments.runs.objects import OF_TEAMS, Objects, is_grid_file
 from experiments.runs.row import Row
 from experiments.runs.schema import (
@@ -27,12 +25,10 @@ from experiments.runs.schema import (
     Leaf,
     RunOptions,
     check_shape,
-    leaves,
     with_leaf,
 )
 from experiments.runs.seeds import stream
 from experiments.runs.targets import check_target
-from experiments.runs.version import code_version
 from sim.errors import InputError, require
 from sim.options import build, find
 from sim.recording import Recording
@@ -49,7 +45,7 @@ class Experiment(Objects):
         with open_composer() as composer:
             return cls(*composer.compose(name_study_files(overrides)).resolve())
 
-    def replace(self, **values: Any) -> Experiment:
+    def with_values(self, **values: Any) -> Experiment:
         """Return the experiment with other values of top-level keys, such as `seed=3`."""
         return dataclasses.replace(self, config={**self.config, **values})
 
@@ -64,14 +60,14 @@ class Experiment(Objects):
         """Return the experiment with an estimator that is not an option of the configuration."""
         kind = type(estimator)
         return dataclasses.replace(
-            self.replace(estimator={"class": f"{kind.__module__}.{kind.__qualname__}"}),
+            self.with_values(estimator={"class": f"{kind.__module__}.{kind.__qualname__}"}),
             choices={**self.choices, "estimator": kind.__name__},
             own_estimator=estimator,
         )
 
     def with_estimator(self, **settings: Any) -> Experiment:
         """Return the experiment with other values of keys of its estimator."""
-        return self.replace(estimator={**self.config["estimator"], **settings})
+        return self.with_values(estimator={**self.config["estimator"], **settings})
 
     def option(self, name: str, default: Any = None) -> Any:
         """An option of the estimator; `default` if it has none of this name."""
@@ -87,10 +83,10 @@ class Experiment(Objects):
         require(
             self.config["calibration"] is None,
             "calibration is for recording=FILE; of a recording in memory take "
-            "read_calibration(FILE).applied(recording)",
+            "read_calibration(FILE).apply_to(recording)",
         )
         self._compare_slip(recording)
-        return self.replace(recording={"checksum": recording.checksum})
+        return self.with_values(recording={"checksum": recording.checksum})
 
     # What a run is called, and where its rows go
 
@@ -146,22 +142,8 @@ class Experiment(Objects):
         return run_key(self.config)
 
     def labels(self, checksum: str) -> Row:
-        """Columns that state a row's origin: choices, keys, version, the recording's checksum.
-
-        Settings that did not make the recording have no column.
-        """
-        stated = effective_config(self.config)
-        brought = ("world", "sensors", "route") if self.from_file else ()
-        choices = {g: name for g, name in self.choices.items() if g in stated and g not in brought}
-        return {
-            **{f"choice.{group}": name for group, name in choices.items()},
-            **_flat({k: v for k, v in stated.items() if k not in ("keep", "picture")}),
-            "repeat": 0,
-            "run_key": self.key,
-            "code_version": code_version(),
-            DEPENDENCIES: "",
-            "recording_checksum": checksum,
-        }
+        """Columns that state a row's origin; see `experiments.runs.key.origin_columns`."""
+        return origin_columns(self.config, self.choices, checksum)
 
     # Whether it fits
 
@@ -295,15 +277,3 @@ def rows_folder(name: Any) -> Path:
         f"name must be one word for a folder of results, such as slip_2, got {name!r}",
     )
     return paths.results() / "runs" / str(name)
-
-
-def _flat(tree: Config) -> Row:
-    """Flatten nested mappings to dotted keys; lists become their text."""
-    return {".".join(map(str, leaf)): _scalar(value) for leaf, value in leaves(tree) if value != {}}
-
-
-def _scalar(value: Any) -> Any:
-    """A value as a table's column holds it."""
-    if isinstance(value, int) and not -(2**63) <= value < 2**63:
-        return str(value)
-    return json.dumps(value) if isinstance(value, (list, tuple)) else value

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from experiments.runs.columns import DEPENDENCIES
+from experiments.runs.row import Row
 from experiments.runs.schema import SIMULATED_KEYS, Config, Leaf, leaves
+from experiments.runs.version import code_version
 from sim.errors import InputError
 
 _NOT_IN_KEY = ("name", "picture", "recording")
@@ -81,6 +84,32 @@ def effective_config(config: Config) -> Config:
     made = any(isinstance(place, dict) and "_target_" in place for place in places)
     unused = () if config["recording"] is None or made else set(SIMULATED_KEYS) - {"seed"}
     return {key: value for key, value in config.items() if key not in unused}
+
+
+def origin_columns(config: Config, choices: Mapping[str, str], checksum: str) -> Row:
+    """Columns that state a row's origin: choices, keys, version, the recording's checksum.
+
+    Settings that did not make the recording have no column.
+    """
+    stated = effective_config(config)
+    brought = () if config["recording"] is None else ("world", "sensors", "route")
+    shown = {key: value for key, value in stated.items() if key not in ("keep", "picture")}
+    return {
+        **{f"choice.{g}": n for g, n in choices.items() if g in stated and g not in brought},
+        **{".".join(map(str, at)): _cell(value) for at, value in leaves(shown) if value != {}},
+        "repeat": 0,
+        "run_key": run_key(config),
+        "code_version": code_version(),
+        DEPENDENCIES: "",
+        "recording_checksum": checksum,
+    }
+
+
+def _cell(value: Any) -> Any:
+    """A value as a table's column holds it; a list becomes its text."""
+    if isinstance(value, int) and not -(2**63) <= value < 2**63:
+        return str(value)
+    return json.dumps(value) if isinstance(value, (list, tuple)) else value
 
 
 def _read(config: Config) -> Any:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,6 +14,7 @@ import numpy as np
 from estimators.base import Estimator, Prior, TeamEstimator
 from experiments.runs.cache import fetch_or_make
 from experiments.runs.calibration import read_calibration
+from experiments.runs.console import warn
 from experiments.runs.dependencies.recorder import Digests, recorded
 from experiments.runs.key import recording_key
 from experiments.runs.schema import (
@@ -270,7 +270,7 @@ class Objects:
     def _calibrated(self, recording: Recording) -> Recording:
         """Return the recording as the calibration has it."""
         path = self.config["calibration"]
-        return recording if path is None else read_calibration(Path(path)).apply(recording)
+        return recording if path is None else read_calibration(Path(path)).apply_to(recording)
 
     def _with_classes(self, recording: Recording) -> Recording:
         """Return the recording with the classes of its sensors that the configuration names too."""
@@ -292,10 +292,9 @@ class Objects:
         for key in ("kr", "kl"):
             asked = key in made_with and key in self.config["estimator"]
             if asked and made_with[key] != believed[key]:
-                print(
+                warn(
                     f"the recording was made with robot.{key}={made_with[key]:g}; "
-                    f"{believed[key]:g} is believed unless robot.{key} or estimator.{key} is set",
-                    file=sys.stderr,
+                    f"{believed[key]:g} is believed unless robot.{key} or estimator.{key} is set"
                 )
 
     # What is known at the start

@@ -1,7 +1,6 @@
 """One run by the command line: a configuration's rows, in results/runs/NAME/KEY.DIGEST.parquet."""
 
 import math
-import shlex
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -9,19 +8,11 @@ from pathlib import Path
 from statistics import fmean
 
 import numpy as np
-from omegaconf import OmegaConf
 
 from estimators.base import Estimate
 from estimators.programs.program import ProgramError
 from experiments.runs import paths
 from experiments.runs.columns import COLUMNS, DEPENDENCIES, REVISED
-from experiments.runs.compose import (
-    CommandLine,
-    check_hydra,
-    name_study_files,
-    open_composer,
-    searched,
-)
 from experiments.runs.console import RunFailedError, progress, show
 from experiments.runs.dependencies.recorder import recorded
 from experiments.runs.evaluate import evaluate
@@ -30,7 +21,7 @@ from experiments.runs.processes import hold_interrupts
 from experiments.runs.row import Outcome, Row
 from experiments.runs.store import keep_dependencies, write_run
 from experiments.trajectories.convert import write_estimate
-from sim.errors import InputError, require
+from sim.errors import require
 from sim.recording import Recording
 from sim.team import Team, save
 
@@ -132,7 +123,7 @@ def record(experiment: Experiment, out: Path) -> bool:
     drives = [f"{robot.status}, {robot.duration_s:.1f} s" for robot in made.robots]
     if experiment.team is not None:
         drives = [f"robot {number}: {drive}" for number, drive in enumerate(drives)]
-    print(f"{out}: {'; '.join(drives)}, checksum {checksum}")
+    show(f"{out}: {'; '.join(drives)}, checksum {checksum}")
     return all(robot.status == "ok" for robot in made.robots)
 
 
@@ -140,43 +131,6 @@ def _trace(error: Exception | SystemExit) -> None:
     """Print where an error came from, unless it is a program's, whose own message says so."""
     if not isinstance(error, ProgramError):
         traceback.print_exception(error)
-
-
-def application(arguments: Sequence[str], draw: Draw, out: Path | None = None) -> None:
-    """Run one configuration by a command line's arguments, or print it.
-
-    Sweeps are those of `sweeps.launch`.
-    """
-    line = CommandLine.of(arguments)
-    check_hydra(line.overrides)
-    with open_composer(searched(line.config_dir)) as composer:
-        found = composer.compose(name_study_files(line.overrides))
-    if line.shown:
-        print(OmegaConf.to_yaml(found.cfg, resolve=line.resolved))
-        return
-    if found.cfg.get("sweeps") or found.params:
-        study = found.choices.get("study")
-        raise InputError(f"study={study} sweeps values; add -m: estima run -m study={study}")
-    experiment = Experiment(*found.resolve())
-    run_once(experiment, draw, out)
-    _say_next(experiment, line)
-
-
-def _say_next(experiment: Experiment, line: CommandLine) -> None:
-    """Say what can be done after a simulated run."""
-    if experiment.from_file:
-        return
-    options = ["--config-dir", line.config_dir] if line.config_dir else []
-    others = [word for word in line.overrides if word.lstrip("+").partition("=")[0] != "seed"]
-    said = shlex.join(["estima", "run", *others, *options])
-    show(f"Next: intervals over ten drives: {said} -m 'seed=range(0,10)'")
-    if experiment.command is not None:  # `view` cannot be told it
-        return
-    drive = shlex.join(["estima", "record", "-o", "run.npz", *line.overrides, *options])
-    view, place = ["estima", "view", "run.npz", "-e", experiment.estimator_name, *options], "window"
-    if experiment.team is not None:
-        view, place = [*view, "-o", "run.html"], "file"
-    show(f"      as it moves, in a {place}: {drive} && {shlex.join(view)}")
 
 
 _SHOWN = (

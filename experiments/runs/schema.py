@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -16,7 +15,7 @@ from omegaconf import DictConfig, OmegaConf
 from estimators.team import Communication
 from experiments.runs.paths import CONF
 from sim import sensors
-from sim.errors import InputError, require
+from sim.errors import InputError, describe_unknown, require
 from sim.options import Count, NonNegative, Option, Positive, described, find, options
 from sim.robot.drive import DifferentialDrive
 
@@ -118,21 +117,17 @@ KEYS = (*_MAPPINGS, "seed", "world_seed", "recording", "calibration", "name")
 KEYS += ("repeats", "keep", "picture")
 
 
-def describe_unknown(key: str, known: Iterable[str]) -> str:
-    """Say that a key is unknown, and which ones are known, the nearest spelled first."""
-    names = list(known)
-    near = difflib.get_close_matches(key, names, n=3)
-    return f"unknown key {key}; known: {', '.join(dict.fromkeys([*near, *names])) or 'none'}"
-
-
 def describe_unknown_key(key: str, config: Mapping[str, Any]) -> str:
     """Say that a key is unknown, and which ones are known next to it."""
-    place = ""
-    for part in key.split(".")[:-1]:
+    *parents, last = key.split(".")
+    for depth, part in enumerate(parents):
         if not isinstance(config.get(part), Mapping):
+            parents, last = parents[:depth], ".".join([*parents[depth:], last])
             break
-        place, config = f"{place}{part}.", config[part]
-    return describe_unknown(key, (f"{place}{name}" for name in config if name != "hydra"))
+        config = config[part]
+    return describe_unknown(
+        last, (name for name in config if name not in ("hydra", "_target_")), ".".join(parents)
+    )
 
 
 def leaves(tree: Mapping[str, Any], above: Leaf = ()) -> Iterator[tuple[Leaf, Any]]:
@@ -162,14 +157,14 @@ def fill(cfg: DictConfig) -> None:
     These are those of the robot, and of each `_target_` of a world, sensor, route and estimator.
     """
     for place in _places(cfg, GROUPS):
-        settings = select(cfg, place)
+        settings = value_at(cfg, place)
         if isinstance(settings, DictConfig):
             with suppress(InputError):  # `check` says it
                 filled = _filled(_target(settings, place), OmegaConf.to_container(settings))  # type: ignore[arg-type]
                 OmegaConf.update(cfg, place, filled, merge=False)
 
 
-def select(cfg: DictConfig, key: str) -> Any:
+def value_at(cfg: DictConfig, key: str) -> Any:
     """What stands at a key; None if it cannot be resolved."""
     return OmegaConf.select(cfg, key, throw_on_resolution_failure=False)
 
@@ -179,7 +174,7 @@ def _places(cfg: DictConfig, groups: Iterable[str]) -> Iterator[str]:
     for group in groups:
         if group != "sensors":
             yield group
-        elif isinstance(sensors := select(cfg, group), DictConfig):
+        elif isinstance(sensors := value_at(cfg, group), DictConfig):
             yield from (f"sensors.{name!s}" for name in sensors)
 
 
@@ -187,7 +182,7 @@ def _target(settings: DictConfig, place: str) -> Callable[..., Any]:
     """What takes the settings of a place."""
     if place == "robot" and "_target_" not in settings:
         return DifferentialDrive
-    return find(select(settings, "_target_"), place)
+    return find(value_at(settings, "_target_"), place)
 
 
 def _filled(target: Callable[..., Any], given: Mapping[str, Any]) -> Config:
@@ -268,7 +263,7 @@ def describe_option(group: str, name: str, searched: Sequence[str] = ()) -> str:
         places = [f"{group}.{only}"]
     parts = []
     for place in places or _places(cfg, [group]):
-        if (settings := select(cfg, place)) is not None:
+        if (settings := value_at(cfg, place)) is not None:
             stated: Config = OmegaConf.to_container(settings)  # type: ignore[assignment]
             title = f"{place}: {stated['_target_']}" if "_target_" in stated else place
             parts.append("\n".join([title, *_said(_target(settings, place), stated)]))
@@ -332,11 +327,9 @@ def robot_config(config: Config, settings: TeamSettings, number: int) -> Config:
     own = {key: value for key, value in config.items() if key != "team"}
     for group, values in settings.robots[number].items():
         where = f"team.robots[{number}].{group}"
-        require(group in _OWN, f"unknown key {where}; known: {', '.join(_OWN)}")
+        require(group in _OWN, describe_unknown(group, _OWN, f"team.robots[{number}]"))
         require(isinstance(values, Mapping), f"{where} must hold keys, got {values!r}")
         for key in [key for key in values if key not in own[group]]:
-            raise InputError(
-                describe_unknown(f"{where}.{key}", (f"{where}.{name}" for name in own[group]))
-            )
+            raise InputError(describe_unknown(key, own[group], where))
         own[group] = {**own[group], **values}
     return own

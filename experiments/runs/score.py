@@ -112,7 +112,7 @@ def match_and_align(recording: Recording, given: Estimate, how: Scoring) -> Scor
         len(rows) >= _FEWEST_POSES,
         f"{len(np.unique(rows))} of {len(stamps)} poses meet the truth, at least {_FEWEST_POSES} "
         f"must: the trajectory is from {stamps[0]:.13g} to {stamps[-1]:.13g} s, the truth from "
-        f"{true_start:.13g} to {true_end:.13g} s; write stamps in seconds, or set --offset",
+        f"{true_start:.13g} to {true_end:.13g} s; write stamps in seconds, or set an offset",
     )
     means, covariances = given.means[rows], given.covariances[rows]
     T = np.zeros(3)
@@ -235,11 +235,11 @@ def score_files(
     """
     folder = rows_folder(name)
     alone = len(trajectories) == 1 or (estimator is None and how.cpu_seconds is None)
-    require(alone, "--as and --cpu-seconds apply to one trajectory; score them one by one")
+    require(alone, "a name and a processor time belong to one trajectory; score them one by one")
     names = [estimator or trajectory.stem for trajectory in trajectories]
     require(
         len(set(names)) == len(names),
-        f"two trajectories called {max(names, key=names.count)}; score them one by one with --as",
+        f"two trajectories called {max(names, key=names.count)}; score and name them one by one",
     )
     recording, results = read_any([path]), []
     for trajectory, called in zip(trajectories, names, strict=True):

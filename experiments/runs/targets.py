@@ -4,7 +4,7 @@ import inspect
 from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
-from sim.errors import InputError, require
+from sim.errors import InputError, describe_unknown, require
 from sim.options import find
 
 
@@ -51,12 +51,10 @@ def check_target(
     known = inspect.signature(function).parameters
     variadic = {name for name, p in known.items() if p.kind in (p.VAR_KEYWORD, p.VAR_POSITIONAL)}
     open_ended = any(p.kind is p.VAR_KEYWORD for p in known.values())
-    free = ", ".join(name for name in known if name not in injected) or "none"
+    free = [name for name in known if name not in injected]
     for key in settings:
-        require(
-            open_ended or key in known or key == "_target_",
-            f"unknown key {where}.{key} for {target}; known: {free}",
-        )
+        if not open_ended and key not in known and key != "_target_":
+            raise InputError(describe_unknown(key, free, where))
     for name, parameter in known.items():
         if name in settings:
             kind = getattr(parameter.annotation, "__name__", str(parameter.annotation))

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import shlex
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,7 +14,8 @@ from experiments.runs.columns import REPEAT, is_setting
 from experiments.runs.compose import find_option, searched
 from experiments.runs.experiment import Experiment
 from experiments.runs.store import fresh_rows, read_runs
-from experiments.sweeps.collect import commands, folder_of
+from experiments.sweeps.collect import folder_of
+from experiments.sweeps.commands import noted_config_dir
 from experiments.viewing.estimates import OnStep, with_estimates_by
 from experiments.viewing.play import Showing, play
 from experiments.viewing.playback import Playback
@@ -77,16 +76,6 @@ def row_of(word: str) -> pd.Series[Any] | None:
     require(same.any(), f"{word}: it comes from another version of the code; run the sweep again")
     require(same.sum() == 1, f"{word}: {same.sum()} runs have keys that begin so; give more digits")
     return rows[same].iloc[0]
-
-
-def noted_config_dir(folder: Path) -> str | None:
-    """The folder of options that the last sweep into a folder of rows named, if any did."""
-    for command in reversed(commands(folder)):
-        with suppress(ValueError):  # edited by hand
-            words = shlex.split(command)
-            if "--config-dir" in words[:-1]:
-                return words[words.index("--config-dir") + 1]
-    return None
 
 
 def run_of_row(

@@ -43,8 +43,8 @@ def rule(
     kinds = {average_of(name) for name in names}
     if kinds == {Average.PLAIN}:
         return f"Arithmetic mean over {over}{interval}"
-    pooled_first = f", repeats pooled by squares{'' if unit == REPEAT else ' first'}"
-    words = f"Geometric mean over {over}{pooled_first if Average.ERROR in kinds else ''}"
+    pooled = Average.ERROR in kinds and unit != REPEAT
+    words = f"Geometric mean over {over}{', each the RMS of its repeats' if pooled else ''}"
     rest = "; NEES, shares and counts: arithmetic" if Average.PLAIN in kinds else ""
     return f"{words}{interval}{rest}"
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from difflib import get_close_matches
 from pathlib import Path
@@ -21,7 +20,7 @@ from experiments.runs.columns import (
     STATUS,
     is_setting,
 )
-from experiments.runs.console import pluralize
+from experiments.runs.console import pluralize, warn
 from experiments.runs.paths import results
 from experiments.runs.store import fresh_rows, read_runs, stale_because
 from experiments.runs.version import code_version
@@ -29,7 +28,6 @@ from sim.errors import InputError, printable, require
 
 FEW = 12  # colours, and panels
 _TIMES = ["step_time_us", "cpu_time_us"]  # they differ from run to run
-COMMAND = "command.txt"  # beside the rows: the commands that made them
 UNFINISHED = "unfinished-{}.txt"  # there until its sweep has ended: how many runs, and its command
 DRAWN = ("seed", "world_seed")  # settings that only draw other samples
 _NAMED = 12  # columns that a message names
@@ -70,13 +68,13 @@ def collect(name: str, *, all_versions: bool = False, times: bool = False) -> pd
         )
         if not mine.all():
             left_out = pluralize((~mine).sum(), "row")
-            print(f"left out {left_out} of other versions of the code{why}", file=sys.stderr)
+            warn(f"left out {left_out} of other versions of the code{why}")
         table = table[mine].drop_duplicates(["run_key", REPEAT], keep="last")
         table = table.assign(code_version=code_version())  # which would make the same
     for n_runs, command in unfinished_sweeps(path):
         here = pluralize(table["run_key"].nunique(), "run")
         words = f"{here} so far: the sweep of {n_runs} is unfinished; to go on: {command}"
-        print(printable(words), file=sys.stderr)
+        warn(printable(words))
     settings = swept_settings(table)
     _check_distinct(table, settings, path)
     if not times:
@@ -116,12 +114,6 @@ def folder_of(name: str) -> Path:
             return path
     there = sorted(p.name for p in runs.glob("*") if p.is_dir())
     raise InputError(f"no sweep named {name}; there are: {', '.join(there) or 'none'}")
-
-
-def commands(folder: Path) -> list[str]:
-    """Commands that made the rows of a folder, as the sweeps noted them."""
-    path = folder / COMMAND
-    return path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
 
 
 def _check_distinct(table: pd.DataFrame, settings: list[str], path: Path) -> None:

@@ -11,9 +11,7 @@ import os
 import platform
 import re
 import secrets
-import shlex
 import shutil
-import signal
 import sys
 import threading
 import time
@@ -21,18 +19,19 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import hydra
 import numpy as np
 from omegaconf import DictConfig
 
 from experiments.runs import paths, store
-from experiments.runs.compose import CommandLine, check_hydra
-from experiments.runs.console import RunFailedError, pluralize, progress
+from experiments.runs.console import RunFailedError, pluralize, progress, warn
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Outcome, Status
-from experiments.sweeps.collect import COMMAND, UNFINISHED, commands
-from experiments.sweeps.plan import Numbers, Plan, make_plan, pack_jobs
+from experiments.sweeps.collect import UNFINISHED
+from experiments.sweeps.commands import note_command
+from experiments.sweeps.plan import Numbers, Plan, make_plan
 from experiments.sweeps.work import (
     compiling_file,
     end_with,
@@ -49,14 +48,6 @@ _JOBS_PER_CORE = 4  # enough to keep all busy to the end, few enough to cost lit
 # What launchers raise when a process of theirs has died; Ray and submitit are extras
 _DIED = {"UncompletedJobError", "WorkerCrashedError", "NodeDiedError", "OutOfMemoryError"}
 OnDone = Callable[[Path, int], None]
-
-
-def sweep_arguments(arguments: Sequence[str], on_done: OnDone) -> None:
-    """Sweep by a command line's arguments: overrides, and `--config-dir` with its folder."""
-    line = CommandLine.of(arguments)
-    require(not line.shown, "one configuration can be shown, not a sweep; leave out the lists")
-    signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGINT))  # end as by Ctrl-C
-    sweep(line.overrides, line.config_dir, on_done)
 
 
 def sweep(
@@ -84,14 +75,13 @@ def sweep(
     RunFailedError
         If a run failed; all others are done, and the rows of the failed ones say how.
     """
-    check_hydra(arguments)
     launching = [a for a in arguments if a.lstrip("+~").startswith(_LAUNCHING)]
     _check_launcher(launching)
     n_jobs = _n_jobs(launching)
     own = [a for a in arguments if a not in launching]
     plan = make_plan(own, config_dir)
     require(len(plan.keys), f"no runs: a value of {' '.join(own)} is an empty range or list")
-    plan = plan.called(_name(plan, own, config_dir))
+    plan = plan.name_by(own, config_dir)
     folder = plan.experiment(0).rows_folder
     require(
         folder.is_dir() or not folder.exists(),
@@ -102,12 +92,9 @@ def sweep(
     done = np.isin(keys, store.ended(folder, damaged=_drop).done)
     runs = np.sort(first[~done])
     check(plan, runs)
-    command = _note_command(folder, arguments, config_dir)
+    command = note_command(folder, arguments, config_dir)
     unfinished = folder / UNFINISHED.format(hashlib.sha256(command.encode()).hexdigest()[:8])
-    print(
-        f"{pluralize(len(keys), 'run')}, {done.sum()} of them done before: {paths.short(folder)}",
-        file=sys.stderr,
-    )
+    warn(f"{pluralize(len(keys), 'run')}, {done.sum()} of them done before: {paths.short(folder)}")
     if not len(runs):
         unfinished.unlink(missing_ok=True)
         on_done(folder, len(keys))
@@ -130,30 +117,6 @@ def sweep(
         raise RunFailedError(f"{len(bad)} of {len(keys)} runs; first: {why}")
 
 
-def _name(plan: Plan, own: Sequence[str], config_dir: str | None) -> str | None:
-    """A sweep's own name where none is given: a digest of its overrides; else None.
-
-    So the same command goes on where it stopped, and two sweeps do not pool their rows.
-    """
-    given = any(argument.lstrip("+").startswith("name=") for argument in own)
-    if given or plan.experiment(0).name != _UNNAMED:
-        return None
-    last = {argument.partition("=")[0]: argument for argument in own}  # that one is swept
-    text = json.dumps([sorted(last.values()), config_dir and str(Path(config_dir).resolve())])
-    return f"sweep_{hashlib.sha256(text.encode()).hexdigest()[:8]}"
-
-
-def _note_command(folder: Path, arguments: Sequence[str], config_dir: str | None) -> str:
-    """Keep the command beside the rows, for pages that show them, and return it."""
-    path = folder / COMMAND
-    require_file(path)
-    options = ["--config-dir", config_dir] if config_dir else []
-    command = " ".join(shlex.join(["estima", "run", "-m", *options, *arguments]).splitlines())
-    if command not in (noted := commands(folder)):
-        write_text(path, "\n".join([*noted, command]) + "\n")
-    return command
-
-
 def check(plan: Plan, runs: Numbers) -> None:
     """Check runs before the first begins: all of a small family, and those along each axis."""
     wanted = {(f, n) for f in np.unique(plan.family[runs]) for n in plan.families[f].spread()}
@@ -170,7 +133,7 @@ def _drop(path: Path, error: InputError) -> None:
     """
     if not store.has_checksum(path) or isinstance(error.__cause__, OSError):
         raise error
-    print(f"estima: {path} does not match its checksum; its runs are done again", file=sys.stderr)
+    warn(f"estima: {path} does not match its checksum; its runs are done again")
     path.unlink(missing_ok=True)
 
 
@@ -202,16 +165,16 @@ class Jobs:
         """File that is there while the sweep runs."""
         return self.folder / f"plan-{self.name}.json"
 
-    def add(self, plan: Plan, runs: Numbers) -> str:
-        """Write a job's share of the plan; return its number."""
+    def add(self, n_runs: int, families: Sequence[Any]) -> str:
+        """Write a job's share of the plan, as `Plan.split` gives it; return its number."""
         number = len(self.sizes)
         journal = self.folder / f"rows-{self.name}-{number}{store.JOURNAL}"
-        self.sizes[journal] = len(runs)
+        self.sizes[journal] = n_runs
         share = {
             "planner": [platform.node(), os.getpid()],
             "places": [os.getcwd(), str(paths.results())],
             "journal": str(journal),
-            "families": plan.as_json(runs),
+            "families": families,
         }
         write_text(share_path(self.plan, number), json.dumps(share))
         return str(number)
@@ -252,8 +215,7 @@ def _launch(plan: Plan, runs: Numbers, jobs: Jobs, launching: Sequence[str]) -> 
     """
     from joblib.externals.loky.process_executor import TerminatedWorkerError
 
-    parts = pack_jobs(plan.recordings[runs], jobs.count)
-    numbers = [jobs.add(plan, runs[part]) for part in parts]
+    numbers = [jobs.add(*share) for share in plan.split(runs, jobs.count)]
     arguments, os.environ["HYDRA_FULL_ERROR"] = sys.argv, "1"  # its errors come to the caller
     sys.argv = [
         "estima run",
@@ -326,7 +288,6 @@ def _tidy(folder: Path) -> None:
     store.tidy(folder, is_running)
 
 
-_UNNAMED = "run"  # the default of conf/config.yaml
 _LAUNCHING = ("hydra/launcher", "hydra.launcher", "jobs=")
 _EXTRAS = {"submitit": "slurm", "ray": "ray"}
 
@@ -401,7 +362,7 @@ def _watched(jobs: Jobs, n_runs: int) -> Iterator[None]:
                 over = ended.wait(0.5)
                 noted_ns = note.stat().st_mtime_ns if note.exists() else 0
                 if noted_ns and not compiled_ns:
-                    print(ANNOUNCED, file=sys.stderr, flush=True)
+                    warn(ANNOUNCED)
                 for journal in list(jobs.sizes):
                     counts[journal] = _counted(journal, jobs.sizes[journal], counts.get(journal))
                 done, failed = (sum(count[i] for count in counts.values()) for i in (1, 2))

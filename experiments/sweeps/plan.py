@@ -7,12 +7,14 @@ a Family: one configuration, and the values that change in it. A run is a number
 from __future__ import annotations
 
 import functools
+import hashlib
 import itertools
 import json
 import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -32,13 +34,14 @@ from experiments.runs.compose import (
 )
 from experiments.runs.experiment import Experiment
 from experiments.runs.key import decides_recording, leaf_digests
-from experiments.runs.schema import Leaf, leaves, select
+from experiments.runs.schema import Leaf, leaves, value_at
 from sim.errors import InputError, require
 
 Numbers = NDArray[np.int64]
 Digests = NDArray[np.uint64]
 _MOST_RUNS = 10**8  # of a sweep; a million take 0.3 GiB in the planner
 _TOO_MANY = f"a sweep has at most {_MOST_RUNS:,} runs; give fewer values, or several sweeps"
+_UNNAMED = "run"  # the default of conf/config.yaml
 _MOST_CHECKED = 1000  # runs of a family that are checked before the first begins
 
 
@@ -180,8 +183,10 @@ class Plan:
         """One of the runs."""
         return self.families[int(self.family[i])].experiment(int(self.number[i]))
 
-    def called(self, name: str | None) -> Plan:
-        """The plan with another name, if one is given; check that it has just one.
+    def name_by(self, arguments: Sequence[str], config_dir: str | None) -> Plan:
+        """The plan, with a name of its own where none is given: a digest of its arguments.
+
+        So the same command goes on where it stopped, and two sweeps do not pool their rows.
 
         Raises
         ------
@@ -194,19 +199,25 @@ class Plan:
             len(names) == 1 and not swept_,
             "name is the folder of all the rows; a sweep has one, not several",
         )
-        if name is None:
+        given = any(argument.lstrip("+").startswith("name=") for argument in arguments)
+        if given or names != {_UNNAMED}:
             return self
-        families = [replace(f, first=f.first.replace(name=name)) for f in self.families]
+        last = {argument.partition("=")[0]: argument for argument in arguments}  # that one is swept
+        text = json.dumps([sorted(last.values()), config_dir and str(Path(config_dir).resolve())])
+        name = f"sweep_{hashlib.sha256(text.encode()).hexdigest()[:8]}"
+        families = [replace(f, first=f.first.with_values(name=name)) for f in self.families]
         return replace(self, families=families)
 
-    def as_json(self, runs: Numbers) -> list[Any]:
-        """Some of the runs as plain values, for a job."""
-        families = self.family[runs]
-        changes = np.flatnonzero(np.diff(families)) + 1
-        return [
-            self.families[self.family[part[0]]].as_json(self.number[part])
-            for part in np.split(runs, changes)
-        ]
+    def split(self, runs: Numbers, n_jobs: int) -> Iterator[tuple[int, list[Any]]]:
+        """Pack runs into about `n_jobs` jobs: how many each has, and these as plain values."""
+        for places in pack_jobs(self.recordings[runs], n_jobs):
+            share = runs[places]
+            changes = np.flatnonzero(np.diff(self.family[share])) + 1
+            parts = np.split(share, changes)
+            yield (
+                len(share),
+                [self.families[self.family[p[0]]].as_json(self.number[p]) for p in parts],
+            )
 
 
 def plan_experiments(
@@ -324,7 +335,7 @@ def _grid(
         at = dict(zip(outer, places, strict=True))
         lines = [texts[key][place] for key, place in at.items()]
         found, axes = _composed(composer, lines, {key: choices[key] for key in inner})
-        first = Experiment(*found.resolve()).replace(picture=False)
+        first = Experiment(*found.resolve()).with_values(picture=False)
         made = Family(first, tuple(axes[key] for key in inner))
         cells = tuple(at.get(key, slice(None)) for key in choices)
         family[cells] = len(families)
@@ -371,7 +382,7 @@ def _composed(
         else [composer.parse(v).value() if isinstance(v, str) else v for v in each]
         for key, each in followed.items()
     }
-    was_leaf = {key for key in values if not OmegaConf.is_config(select(cfg, key))}
+    was_leaf = {key for key in values if not OmegaConf.is_config(value_at(cfg, key))}
     for key, each in values.items():
         set_value(cfg, key, each[0])
     following = _following(OmegaConf.to_container(cfg, resolve=False))

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 
 import pandas as pd
 
 from experiments.evaluation.statistics import holm
 from experiments.runs.columns import COLUMNS, PATH, RELATIVE
+from experiments.runs.console import warn
 from experiments.runs.row import GAP, Outcome
 from experiments.sweeps.averages import (
     RECORDING,
@@ -131,7 +131,7 @@ def _rows_of(estimator: str, table: pd.DataFrame) -> pd.DataFrame:
         there = ", ".join(sorted(sound["choice.estimator"].unique()))
         raise InputError(f"{why}; there are {there or 'no others'}")
     if own := [c for c in distinguishing_settings(one) if c.startswith("estimator.")]:
-        print(f"{estimator} is the mean over its {', '.join(own)}", file=sys.stderr)
+        warn(f"{estimator} is the mean over its {', '.join(own)}")
     return one
 
 

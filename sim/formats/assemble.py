@@ -184,7 +184,7 @@ def scanner(
 
 
 def seen_ranges(raw_m: Array, max_range_m: float) -> Floats:
-    """Ranges with +inf where nothing was seen: at the maximum or beyond, zero, or no number."""
+    """Ranges with +inf where nothing was seen: at or beyond the maximum, zero, or not a number."""
     return np.where((raw_m > 0.0) & (raw_m < max_range_m), raw_m, np.inf).astype(np.float32)
 
 

@@ -1,6 +1,7 @@
 """Which format a file is in, and a Recording of it, whatever it is."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from sim.errors import InputError, naming, require
@@ -17,59 +18,143 @@ from sim.recording import Recording
 from sim.recording_check import check_recording
 from sim.team import Team, load
 
-KINDS = ("recording", "rosbag", "mrclam", "carmen", "intel", "khepera", "lego", "rawseeds", "wean")
 _HEAD_BYTES = 1 << 16
 
 
+@dataclass(frozen=True)
+class LogFormat:
+    """How a log format is recognised and read.
+
+    Attributes
+    ----------
+    name
+        What `kind_of` calls it.
+    read
+        Reads its files into a Recording.
+    begins
+        First bytes of its files.
+    has_name
+        Whether a name belongs to a file of its folders and archives.
+    has_text
+        Whether a text has this format, by its beginning, and that as lines without comments.
+    n_files
+        Least and greatest number of files that a log comes in.
+    """
+
+    name: str
+    read: Callable[..., Recording]
+    begins: tuple[bytes, ...] = ()
+    has_name: Callable[[str], bool] = lambda _: False
+    has_text: Callable[[bytes, Sequence[bytes]], bool] = lambda *_: False
+    n_files: tuple[int, int] = (1, 1)
+
+
+def _read_khepera(path: Path) -> Recording:
+    """Recording of a file of tuples, or of the first of an archive or a folder."""
+    member = None
+    if path.is_dir() or _is_archive(read_bytes(path)):
+        tuples = [name for name in read_members(path) if name.endswith(".tuple")]
+        member = min(tuples, key=lambda name: (len(name), name))
+    return khepera.to_recording(khepera.read_khepera(path, member))
+
+
+def _first_words(lines: Sequence[bytes]) -> set[bytes]:
+    return {line.split()[0] for line in lines[:200]}
+
+
+_CARMEN = {b"FLASER", b"ROBOTLASER1", b"ODOM", b"VERTEX2"}
+# In the order in which they are tried
+FORMATS = (
+    LogFormat(
+        "mrclam",
+        read_mrclam,
+        has_name=lambda name: name.endswith(("_Odometry.dat", "_Odometry.dat.gz")),
+    ),
+    LogFormat(
+        "rosbag",
+        read_bag,
+        begins=(b"#ROSBAG V2.0\n", b"\x89MCAP", b"SQLite format 3"),
+        has_name=lambda name: name == "metadata.yaml",
+    ),
+    LogFormat(
+        "carmen",
+        lambda path: carmen.to_recording(carmen.read_carmen(path)),
+        has_text=lambda _, lines: bool(_first_words(lines) & _CARMEN),
+    ),
+    LogFormat(
+        "wean",
+        read_wean,
+        has_text=lambda _, lines: bool(lines) and _first_words(lines) <= {b"O", b"L"},
+    ),
+    LogFormat(
+        "lego",
+        read_lego,
+        has_text=lambda _, lines: bool(lines) and _first_words(lines) <= {b"M"},
+        n_files=(2, 4),
+    ),
+    LogFormat(
+        "khepera",
+        _read_khepera,
+        has_name=lambda name: name.endswith(".tuple"),
+        has_text=lambda head, _: b'"sm"' in head and b'"phi_l"' in head,
+    ),
+    LogFormat(
+        "intel",
+        read_intel,
+        has_text=lambda head, _: head.lstrip()[:1] == b"{" and b'"map"' in head,
+        n_files=(1, 2),
+    ),
+    LogFormat(
+        "rawseeds",
+        read_rawseeds,
+        has_text=lambda _, lines: bool(lines) and lines[0].count(b",") == 6,
+        n_files=(2, 3),
+    ),
+)
+
+
 def kind_of(path: Path) -> str:
-    """Format of a file or folder, by its contents.
+    """Format of a file or folder by its contents: recording, or the name of one of `FORMATS`.
 
     Raises
     ------
     InputError
-        If it is none of `KINDS`.
+        If it is none of them.
     """
+    return "recording" if _is_recording(path) else _format_of(path).name
+
+
+def _is_recording(path: Path) -> bool:
+    return not path.is_dir() and read_head(path)[:4] == b"PK\x03\x04"
+
+
+def _format_of(path: Path) -> LogFormat:
     if path.is_dir():
-        return _kind_of_names([p.name for p in path.iterdir()], path)
+        return _format_of_names([p.name for p in path.iterdir()], path)
     head = read_head(path)
-    if head[:4] == b"PK\x03\x04":
-        return "recording"
-    if head[:13] == b"#ROSBAG V2.0\n" or head[:5] == b"\x89MCAP" or head[:15] == b"SQLite format 3":
-        return "rosbag"
+    for each in FORMATS:
+        if each.begins and head.startswith(each.begins):
+            return each
     data = read_bytes(path)
     if _is_archive(data):
-        return _kind_of_names(list(read_members(path)), path)
-    return _kind_of_text(data[:_HEAD_BYTES], path)
-
-
-def _kind_of_names(names: Sequence[str], path: Path) -> str:
-    if any(name.endswith(("_Odometry.dat", "_Odometry.dat.gz")) for name in names):
-        return "mrclam"
-    if "metadata.yaml" in names:
-        return "rosbag"
-    if any(name.endswith(".tuple") for name in names):
-        return "khepera"
-    raise InputError(f"{path}: holds no log of a known format ({', '.join(sorted(names)[:5])})")
-
-
-def _kind_of_text(head: bytes, path: Path) -> str:
-    lines = [line for line in head.split(b"\n") if line.strip() and not line.startswith(b"#")]
-    first_words = {line.split()[0] for line in lines[:200]}
-    if first_words & {b"FLASER", b"ROBOTLASER1", b"ODOM", b"VERTEX2"}:
-        return "carmen"
-    for kind, keywords in (("wean", {b"O", b"L"}), ("lego", {b"M"})):
-        if first_words and first_words <= keywords:
-            return kind
-    if b'"sm"' in head and b'"phi_l"' in head:
-        return "khepera"
-    if head.lstrip()[:1] == b"{" and b'"map"' in head:
-        return "intel"
-    if lines and lines[0].count(b",") == 6:
-        return "rawseeds"
+        return _format_of_names(list(read_members(path)), path)
+    text = data[:_HEAD_BYTES]
+    lines = [line for line in text.split(b"\n") if line.strip() and not line.startswith(b"#")]
+    for each in FORMATS:
+        if each.has_text(text, lines):
+            return each
+    known = ", ".join(each.name for each in FORMATS)
     raise InputError(
-        f"{path}: not a log of a known format; known: {', '.join(KINDS)} "
+        f"{path}: not a log of a known format; known: recording, {known} "
         "(see docs/formats.md); a map's .yaml is none: it is drawn over a recording"
     )
+
+
+def _format_of_names(names: Sequence[str], path: Path) -> LogFormat:
+    for each in FORMATS:
+        if any(map(each.has_name, names)):
+            return each
+    raise InputError(f"{path}: holds no log of a known format ({', '.join(sorted(names)[:5])})")
 
 
 def read_all(paths: Sequence[Path], robot: int | None = None) -> Team:
@@ -88,19 +173,21 @@ def read_all(paths: Sequence[Path], robot: int | None = None) -> Team:
     InputError
         If the format is not known, a file is missing, or cannot be read.
     """
-    first, kind = paths[0], kind_of(paths[0])
-    _check_count(paths, kind)
-    if kind == "recording":  # which is checked as it is loaded
+    first = paths[0]
+    if _is_recording(first):  # which is checked as it is loaded
+        require(len(paths) == 1, f"{first}: a recording is one file, got {len(paths)}")
         team = load(first)
         if robot is None or len(team) == 1:
             return team
         known = range(len(team))
         require(robot in known, f"{first}: its robots are 0 to {known[-1]}, got {robot}")
         return Team((team.robots[robot],))
-    if kind == "mrclam":
-        recording = read_mrclam(first, 1 if robot is None else robot)
-    else:
-        recording = _READERS[kind](*paths)
+    log = _format_of(first)
+    least, most = log.n_files
+    wanted = f"{least} to {most} files" if most > 1 else "one file"
+    require(least <= len(paths) <= most, f"{first}: a {log.name} log is {wanted}, got {len(paths)}")
+    of_robot = {"robot": robot} if log.read is read_mrclam and robot is not None else {}
+    recording = log.read(*paths, **of_robot)
     with naming(first):
         check_recording(recording)
     return Team((recording,))
@@ -111,32 +198,6 @@ def read_any(paths: Sequence[Path], robot: int | None = None) -> Recording:
     team = read_all(paths, robot)
     with naming(paths[0]):
         return team.only
-
-
-def _check_count(paths: Sequence[Path], kind: str) -> None:
-    least, most = {"intel": (1, 2), "rawseeds": (2, 3), "lego": (2, 4)}.get(kind, (1, 1))
-    wanted = f"{least} to {most} files" if most > 1 else "one file"
-    require(least <= len(paths) <= most, f"{paths[0]}: a {kind} log is {wanted}, got {len(paths)}")
-
-
-def _read_khepera(path: Path) -> Recording:
-    """Recording of a file of tuples, or of the first of an archive or a folder."""
-    member = None
-    if path.is_dir() or _is_archive(read_bytes(path)):
-        tuples = [name for name in read_members(path) if name.endswith(".tuple")]
-        member = min(tuples, key=lambda name: (len(name), name))
-    return khepera.to_recording(khepera.read_khepera(path, member))
-
-
-_READERS: dict[str, Callable[..., Recording]] = {
-    "rosbag": read_bag,
-    "carmen": lambda path: carmen.to_recording(carmen.read_carmen(path)),
-    "intel": read_intel,
-    "khepera": _read_khepera,
-    "lego": read_lego,
-    "rawseeds": read_rawseeds,
-    "wean": read_wean,
-}
 
 
 def _is_archive(data: bytes) -> bool:

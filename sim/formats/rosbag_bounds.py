@@ -16,7 +16,7 @@ def check_bounds(path: Path) -> None:
     files = sorted(path.iterdir()) if path.is_dir() else [path]
     require(
         sum(file.stat().st_size for file in files) <= MOST_BYTES,
-        f"{path}: more than {MOST_BYTES >> 20} MiB; cut the bag in parts",
+        f"{path}: more than {MOST_BYTES >> 20} MiB; split the bag",
     )
     left = MOST_BYTES
     for file in files:

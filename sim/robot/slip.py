@@ -52,7 +52,7 @@ class SlipOptions:
     unmodelled_slip_m: NonNegative = 0.02
     """Encoder travel of one such event, m."""
     forward_slip_m: NonNegative = 0.0
-    """Variance per metre of what both wheels slip together, m: both encoders err alike."""
+    """Variance per metre of the slip that both wheels share, m: both encoders err alike."""
     forward_slip_length_m: NonNegative = 0.0
     """Travel over which slip of both wheels together is forgotten, m; 0: at once."""
 

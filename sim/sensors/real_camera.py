@@ -40,7 +40,7 @@ class RealCamera(StereoCamera):
 
 
 class DetectingEye:
-    """The camera at work."""
+    """The camera while it records, with the errors that last from image to image."""
 
     def __init__(self, camera: RealCamera, rng: np.random.Generator) -> None:
         self._camera, self._rng = camera, rng

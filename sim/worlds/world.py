@@ -78,8 +78,8 @@ class World:
         require(
             np.ndim(self.descriptors) == 2
             and np.shape(self.look_alike) in ((0,), (len(self.landmarks),)),
-            f"world {self.name}: descriptors must have shape (L, D), and look_alike (L,), of its "
-            f"{len(self.landmarks)} landmarks",
+            f"world {self.name}: its L = {len(self.landmarks)} landmarks need descriptors of shape "
+            "(L, D) and look_alike of shape (L,)",
         )
         for bad in np.flatnonzero(np.hypot(*(self.walls[:, 2:] - self.walls[:, :2]).T) < 1e-6):
             raise InputError(f"world {self.name}: wall {bad} has no length; give it two ends")

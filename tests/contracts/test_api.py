@@ -43,6 +43,20 @@ def test_its_examples():
     assert tried > 12
 
 
+def test_what_it_gives_prints_in_a_line():
+    recording = estima.simulate(*QUICK, "seed=3")
+    run = estima.run(recording, estimator="odometry")
+    for thing in (recording, recording.truth, run, run.online, next(iter(recording.frames()))):
+        assert len(repr(thing)) < 120
+    assert re.fullmatch(
+        r"Run\(odometry on a recording: position RMSE [\d.]+ mm, NEES .+ ms a step\)", repr(run)
+    )
+    assert "55 Frames; wheels alone; Truth(55 poses, a map); ok" in repr(recording)
+    shown = run._repr_html_()
+    assert "position RMSE" in shown
+    assert "data:image/png;base64," in shown
+
+
 @pytest.mark.slow
 def test_the_five_lines_of_the_readme(folder):
     (lines,) = re.findall(r"```py\n(.*?)```", (ROOT / "README.md").read_text(), re.S)

@@ -2,8 +2,9 @@
 
 import pytest
 
+from experiments.cli.arguments import CommandLine
 from experiments.runs import cache, processes
-from experiments.runs.compose import CommandLine, check_hydra, searched
+from experiments.runs.compose import check_overrides, searched
 from experiments.runs.console import exit_with
 from experiments.runs.experiment import Experiment
 from sim.errors import InputError
@@ -60,7 +61,7 @@ def test_unknown_options_are_refused_with_the_known_ones(argument):
 )
 def test_settings_of_hydra_that_nothing_reads_are_refused(override):
     with pytest.raises(InputError, match=override.partition("=")[0]):
-        check_hydra([override])
+        check_overrides([override])
 
 
 def test_a_cache_that_cannot_be_cleared_is_one_line(tmp_path, monkeypatch):

@@ -64,7 +64,7 @@ def test_runs_of_gil2008_differ_in_what_their_table_compares(table, compared):
     assert differing(runs) <= compared | STEREO
     for part in filter(None, noises.values()):  # within one noise
         assert differing(part) <= compared
-        scenes = {Scene.of(run.config) for run in part}
+        scenes = {Scene.of(run) for run in part}
         beliefs = {(run.config["estimator"]["kr"], run.config["estimator"]["kl"]) for run in part}
         assert len(beliefs) == 1
         if table == "observations":

@@ -78,7 +78,7 @@ def test_a_full_map_takes_no_more_landmarks(recording, association, monkeypatch)
 def test_a_scan_must_have_the_lasers_number_of_ranges():
     laser = Laser(n_beams=721)
     for n in (0, 100, 720, 722):
-        with pytest.raises(InputError, match=f"a scan of {n} ranges, from a laser of 721 beams"):
+        with pytest.raises(InputError, match=f"a scan of {n} ranges from a laser of 721 beams"):
             beam_ends(np.ones(n), laser, 60)
 
 

@@ -28,7 +28,7 @@ from experiments.evaluation.metrics import (
 from experiments.evaluation.registration_errors import METRICS, measure, sample_scenes
 from experiments.judging.jobs import Progress, Tables, group_by, tables_of
 from experiments.judging.logs import DATA
-from experiments.judging.remake import Remake
+from experiments.judging.remake import Cells, Remake
 from experiments.judging.results import Profile, Results
 from experiments.papers.decristoforis2020.claims import judged_runs
 from experiments.papers.decristoforis2020.settings import (
@@ -161,7 +161,7 @@ REMADE = {
 }  # not pooled errors, and what only figures show
 
 
-def remake(table: str, row: Row) -> Remake:
+def remake(table: str, row: Cells) -> Remake:
     """The call that makes a row again."""
     seed = f"{row.get('seed', 0):.0f}"
     if table == "covariances":

@@ -22,7 +22,7 @@ from sim.arrays import Array
 from sim.errors import InputError
 from sim.recording import Log, Recording, WheelLog, log_of_readings
 from sim.robot.slip import wheel_errors
-from sim.sensors import StereoCamera, View, sensor_of, sensors_from_config
+from sim.sensors import StereoCamera, View, sensor_of
 from sim.sensors.base import sensor_settings, split_schema
 from sim.sensors.rays import ExactRays
 from sim.worlds.world import World
@@ -60,26 +60,27 @@ class Scene:
     alike_share: float = 0.0
 
     @classmethod
-    def of(cls, config: Config) -> Scene:
-        """Read a configuration, and its `recording`."""
-        camera = _camera(config)
+    def of(cls, experiment: Experiment) -> Scene:
+        """Read an experiment's seed, its camera, and the options of its `recording`."""
+        camera, given = _camera(experiment), experiment.options_of("recording")
         return cls(
-            seed=config["seed"],
+            seed=experiment.seed,
             noise="pixel" if camera.correlated else "paper",
             sigma_descriptor=camera.sigma_descriptor,
-            **{key: value for key, value in config["recording"].items() if key != "_target_"},
+            **{key: value for key, value in given.items() if key != "_target_"},
         )
 
 
 def recorded(config: Config, **_scene: Any) -> Recording:
     """Make the recording of a configuration; `Scene.of` reads the keys of its `recording`."""
-    return thin(whole(config), config)
+    experiment = Experiment(config)
+    return thin(whole(experiment), experiment)
 
 
-def whole(config: Config) -> Recording:
-    """Recording of a configuration's scene: all landmarks within 20 m in every image, with ids."""
-    scene, camera = Scene.of(config), _camera(config)
-    driven = _drive(config).recording()
+def whole(experiment: Experiment) -> Recording:
+    """Recording of an experiment's scene: all landmarks within 20 m in every image, with ids."""
+    scene, camera = Scene.of(experiment), _camera(experiment)
+    driven = _drive(experiment).recording()
     # the images do not depend on the noise of the descriptors
     rng = stream(scene.seed, f"gil2008/images/{dataclasses.replace(scene, sigma_descriptor=0.0)}")
     world = _alike(driven.known_world, scene.alike_share, rng)
@@ -103,21 +104,21 @@ def whole(config: Config) -> Recording:
     driven = driven.with_log("stereo", log, camera)
     return dataclasses.replace(
         driven,
-        wheels=driven.wheels if scene.draw == 0 else _wheels(driven, scene, config),
+        wheels=driven.wheels if scene.draw == 0 else _wheels(driven, scene, experiment),
         truth=dataclasses.replace(
             driven.known_truth, readings={"stereo": true.values}, world=world
         ),
     )
 
 
-def thin(recording: Recording, config: Config) -> Recording:
-    """Recording as a configuration's camera would take it.
+def thin(recording: Recording, experiment: Experiment) -> Recording:
+    """Recording as an experiment's camera would take it.
 
     Landmarks are kept by their true distance. The same random order is used for every B, so the
     observations of a smaller B are a subset of those of a larger one.
     """
     log, truth = recording.log("stereo"), recording.known_truth
-    camera, scene = _camera(config), Scene.of(config)
+    camera, scene = _camera(experiment), Scene.of(experiment)
     rng = stream(scene.seed, "gil2008/choice", scene.draw)
     splits = log.known_splits
     image = np.repeat(np.arange(len(log.stamps)), np.diff(splits))
@@ -157,15 +158,15 @@ def true_ids(recording: Recording) -> NDArray[np.int64]:
     return recording.known_truth.readings["stereo"]["true_ids"]
 
 
-def _drive(config: Config) -> Experiment:
-    """Drive of a configuration's robot; it does not depend on the camera."""
-    camera = sensor_settings(StereoCamera(rate_hz=_camera(config).rate_hz))
-    sensors = {**config["sensors"], "stereo": camera}
-    return Experiment({**config, "recording": None, "sensors": sensors})
+def _drive(experiment: Experiment) -> Experiment:
+    """Drive of an experiment's robot; it does not depend on the camera."""
+    camera = sensor_settings(StereoCamera(rate_hz=_camera(experiment).rate_hz))
+    sensors = {**experiment.options_of("sensors"), "stereo": camera}
+    return experiment.with_values(recording=None, sensors=sensors)
 
 
-def _camera(config: Config) -> StereoCamera:
-    camera = sensor_of(sensors_from_config(config["sensors"]), "stereo", StereoCamera)
+def _camera(experiment: Experiment) -> StereoCamera:
+    camera = sensor_of(experiment.sensors(), "stereo", StereoCamera)
     if camera.selection == "spread":
         raise InputError("gil2008 needs sensors.stereo.selection=random or nearest, got spread")
     return camera
@@ -178,9 +179,9 @@ class _NoWalls:
         return np.ones(len(points), np.bool_)
 
 
-def _wheels(driven: Recording, scene: Scene, config: Config) -> WheelLog:
+def _wheels(driven: Recording, scene: Scene, experiment: Experiment) -> WheelLog:
     """Encoders with other errors over the same true travel, by the law of k |ds|."""
-    robot, truth = Experiment(config).robot(), driven.known_truth
+    robot, truth = experiment.robot(), driven.known_truth
     rng = stream(scene.seed, "gil2008/wheels", scene.draw)
     ground = np.diff(truth.wheel_travel_m, axis=0, prepend=0.0)
     error = wheel_errors(ground, [robot.kr, robot.kl], rng)

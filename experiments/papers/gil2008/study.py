@@ -15,7 +15,7 @@ from estimators.odometry import Odometry
 from experiments.bench.fastslam import cost_by_landmarks
 from experiments.evaluation.metrics import position_errors_m, rms, travelled_m
 from experiments.judging.jobs import Progress, Tables, group_by, tables_of
-from experiments.judging.remake import Remake, agrees
+from experiments.judging.remake import Cells, Remake, agrees
 from experiments.judging.results import Profile, Results
 from experiments.papers.gil2008 import scores, settings
 from experiments.papers.gil2008.recordings import Scene, landmark_distances_m, thin, whole
@@ -60,7 +60,7 @@ def run(profile: Profile, out: Results, on_progress: Progress) -> None:
     """
 
     def drawn_from(run: TableRun) -> tuple[Scene, str]:
-        return Scene.of(run[1].config), json.dumps(run[1].options_of("route"))
+        return Scene.of(run[1]), json.dumps(run[1].options_of("route"))
 
     jobs = [
         [part[low : low + _RUNS_PER_JOB]]
@@ -83,18 +83,18 @@ def plan(profile: Profile) -> Iterator[TableRun]:
         ):
             drawn = one.options_of("recording")
             if drawn["draw"] < n_draws and drawn["image_draw"] <= n_repeats:
-                yield table, one.replace(repeats=min(one.repeats, n_repeats))
+                yield table, one.with_values(repeats=min(one.repeats, n_repeats))
 
 
 REMADE = dict.fromkeys(settings.LABELS, 2.7)  # not the times of `cost`
 
 
-def remake(table: str, row: Row) -> Remake | None:
+def remake(table: str, row: Cells) -> Remake | None:
     """The call that makes a row again; None if no run is like it."""
     for one in plan_experiments([f"study=gil2008/{table}", f"seed={row['seed']:.0f}"]):
         camera = sensor_of(one.sensors(), "stereo", StereoCamera)
         shown = {"n_seen": camera.max_observations, "rule": camera.selection}
-        labels = dataclasses.asdict(Scene.of(one.config)) | labels_of(table, one) | shown
+        labels = dataclasses.asdict(Scene.of(one)) | labels_of(table, one) | shown
         if agrees(row, {**labels, "max_distance_m": camera.max_distance_m}):
             return rows_of, ([(table, one)], int(row["repeat"]))
     return None
@@ -103,7 +103,7 @@ def remake(table: str, row: Row) -> Remake | None:
 def rows_of(runs: Sequence[TableRun], repeat: int | None = None) -> Tables:
     """Rows of every run over one recording, by table; those of one repeat, if one is given."""
     first = runs[0][1]
-    scene, recording = Scene.of(first.config), whole(first.config)
+    scene, recording = Scene.of(first), whole(first)
     truth, robot = recording.truth_at(recording.frame_stamps), first.robot()
     prior = first.prior(recording)
     rng = stream(0, "odometry")
@@ -116,7 +116,7 @@ def rows_of(runs: Sequence[TableRun], repeat: int | None = None) -> Tables:
     }
     rows: dict[str, list[Row]] = {}
     for table, experiment in runs:
-        seen = thin(recording, experiment.config)
+        seen = thin(recording, experiment)
         labels = labels_of(table, experiment)
         shown = common | labels | _shown(seen)
         for number in range(experiment.repeats) if repeat is None else [repeat]:

@@ -410,7 +410,8 @@ def recording_from_files(
     if places.ndim != 2 or places.shape[1] != 2:
         raise InputError(f"{positions}: queries need shape (K, 2), got {places.shape}")
     features = read_array(Path(descriptors)).astype(np.float32)
-    return query_recording(places, features, interval_s, stream(config["seed"], "slip"), k=0.0)
+    rng = stream(Experiment(config).seed, "slip")
+    return query_recording(places, features, interval_s, rng, k=0.0)
 
 
 def mapping_run(
@@ -428,7 +429,7 @@ def mapping_run(
         What describes its clouds: a name of `estimators.topological.descriptors.KINDS`, or a
         network as in `described_run`.
     """
-    made = Experiment(config).replace(seed=seed, recording=None).recording()
+    made = Experiment(config).with_values(seed=seed, recording=None).recording()
     if network is not None:
         made = describe_clouds(made, _by_network(network))
     return from_recording(made, descriptor, spacing_m)
@@ -445,7 +446,7 @@ def described_run(config: dict[str, Any], network: dict[str, Any]) -> Recording:
         called with the points.
     """
     return describe_clouds(
-        Experiment(config).replace(recording=None).recording(), _by_network(network)
+        Experiment(config).with_values(recording=None).recording(), _by_network(network)
     )
 
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from estimators.topological.topological_map import from_recording
 from experiments.bench import topological
 from experiments.judging.jobs import Progress, Tables, tables_of
-from experiments.judging.remake import Remake
+from experiments.judging.remake import Cells, Remake
 from experiments.judging.results import Arrays, Profile, Results
 from experiments.papers.maximo2024.claims import headlines
 from experiments.papers.maximo2024.places import oxford_runs, resequence
@@ -140,7 +140,7 @@ def are_here(table: pd.DataFrame) -> NDArray[np.bool_]:
     return np.asarray(~real | POSITIONS.is_file())
 
 
-def remake(table: str, row: Row) -> Remake:
+def remake(table: str, row: Cells) -> Remake:
     """The call that makes a row again."""
     name = row["geometry"]
     of_route = dict.fromkeys(("starts", "kidnapping", "clusters", "particles"), "route")

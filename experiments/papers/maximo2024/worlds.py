@@ -322,7 +322,7 @@ def campus_runs(seed: int) -> tuple[Experiment, Experiment]:
     along[[0, -1]] = way[1] - way[-2]  # the tour is closed
     left = along[:, ::-1] * [-1.0, 1.0] / np.hypot(*along.T)[:, None]
     route = {**mapping.options_of("route"), "waypoints": (way + CAMPUS_SHIFT_M * left).tolist()}
-    return mapping, mapping.replace(seed=seed + 500, route=route)  # the same world_seed
+    return mapping, mapping.with_values(seed=seed + 500, route=route)  # the same world_seed
 
 
 def campus_rows(seed: int, profile: Profile, *, with_clusters: bool) -> dict[str, Rows]:
@@ -363,7 +363,7 @@ def _one_query_a_node(case: Case) -> Case:
     gone = travelled_m(case.recording.truth_at(case.recording.frame_stamps))
     rows = np.unique(np.searchsorted(gone, np.arange(0.0, gone[-1], case.known_map.spacing_m)))
     printed = Experiment.compose(["estimator=topological_mcl_paper"])
-    experiment = case.experiment.replace(estimator=printed.options_of("estimator"))
+    experiment = case.experiment.with_values(estimator=printed.options_of("estimator"))
     return replace(case, experiment=experiment, recording=resequence(case.recording, rows))
 
 

@@ -23,7 +23,7 @@ from experiments.calibration.end_poses import Manoeuvre, from_end_poses
 from experiments.calibration.result import CalibrationResult
 from experiments.evaluation.metrics import ellipse_area_m2, travelled_m
 from experiments.judging.jobs import Progress, Tables, tables_of
-from experiments.judging.remake import Remake, agrees, whole
+from experiments.judging.remake import Cells, Remake, agrees, whole
 from experiments.judging.results import Profile, Results
 from experiments.papers.puzzlebot2024.descent import convergence, gradient_descent
 from experiments.papers.puzzlebot2024.settings import (
@@ -99,7 +99,7 @@ REMADE = {
 }  # not engine_k, which comes from all drives at once
 
 
-def remake(table: str, row: Row) -> Remake:
+def remake(table: str, row: Cells) -> Remake:
     """The call that makes a row again."""
     sets = {"areas": areas, "gradient_descent": gradient_descent, "convergence": convergence}
     if table in sets:

@@ -13,7 +13,7 @@ from estimators.base import Estimate
 from experiments.evaluation.map_quality import landmark_errors
 from experiments.evaluation.metrics import travelled_m
 from experiments.judging.jobs import Progress, Tables, tables_of
-from experiments.judging.remake import Remake
+from experiments.judging.remake import Cells, Remake
 from experiments.judging.results import Profile, Results
 from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
@@ -53,7 +53,7 @@ def run(profile: Profile, out: Results, on_progress: Progress) -> None:
 REMADE = {"runs": 5.0, "coverage": 5.0}
 
 
-def remake(_table: str, row: Row) -> Remake:
+def remake(_table: str, row: Cells) -> Remake:
     """The call that makes a row again."""
     return tables_from, (int(row["seed"]), row["strategy"])
 
@@ -87,7 +87,7 @@ def compose_experiment(seed: int, strategy: str) -> Experiment:
 
 
 def coverage(team: Team, resolution_m: float) -> tuple[Array, Array]:
-    """Mean distance (T,) m driven a robot, and floor (T,) m^2 that the team has seen by then.
+    """Mean distance driven per robot (T,) m, and floor area seen by then (T,) m^2.
 
     Floor is what can be reached from the start, and seen what a beam has crossed, by the truth.
     """

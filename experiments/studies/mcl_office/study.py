@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from experiments.evaluation.metrics import heading_errors_rad, position_errors_m, travelled_m
 from experiments.evaluation.statistics import bootstrap_interval, share_interval
 from experiments.judging.jobs import Progress, Tables, tables_of
-from experiments.judging.remake import Remake
+from experiments.judging.remake import Cells, Remake
 from experiments.judging.results import Profile, Results
 from experiments.runs.console import RunFailedError
 from experiments.runs.evaluate import run_over
@@ -45,7 +45,7 @@ def run(profile: Profile, out: Results, on_progress: Progress) -> None:
 REMADE = {"starts": 15.0}  # the shares are means of them
 
 
-def remake(_table: str, row: Row) -> Remake:
+def remake(_table: str, row: Cells) -> Remake:
     """The call that makes a row again."""
     office = Experiment.compose(["study=mcl_office", f"seed={row['seed']:.0f}"])
     return starts, (office, N_STARTS, [int(row["start"])])

@@ -2,7 +2,6 @@
 
 import importlib.metadata
 import subprocess
-import sys
 
 import numpy as np
 import pandas as pd
@@ -10,9 +9,10 @@ import pandas as pd
 from estimators.peers import MissingPackageError
 from experiments.evaluation.statistics import log_ratio_interval
 from experiments.judging.jobs import Progress, Tables, answer_of, group_by, tables_of
-from experiments.judging.remake import Remake, agrees
+from experiments.judging.remake import Cells, Remake, agrees
 from experiments.judging.results import Profile, Results
 from experiments.runs.compose import find_option
+from experiments.runs.console import warn
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Outcome, Row
 from experiments.studies.peers.settings import LASER, PACKAGES, READS, TUNED
@@ -36,7 +36,7 @@ def run(profile: Profile, out: Results, on_progress: Progress) -> None:
     one_each = {experiment.estimator_name: experiment for experiment in experiments}
     absent = {name: why for name, experiment in one_each.items() if (why := missing(experiment))}
     for name, reason in absent.items():
-        print(f"{name}: left out, {reason}", file=sys.stderr)
+        warn(f"{name}: left out, {reason}")
     present = [e for e in experiments if e.estimator_name not in absent]
     drives = group_by(present, lambda e: (e.choices["world"], e.seed))
     made = tables_of(runs, [(drive,) for drive in drives], on_progress)
@@ -49,7 +49,7 @@ def run(profile: Profile, out: Results, on_progress: Progress) -> None:
 REMADE = {"runs": 8.0}  # methods are means of them
 
 
-def remake(_table: str, row: Row) -> Remake | None:
+def remake(_table: str, row: Cells) -> Remake | None:
     """The call that makes a row again; None if its method is not here."""
     option = find_option("estimator", row["estimator"])
     given = ["study=peers", f"seed={row['seed']:.0f}", f"estimator={option}"]
@@ -133,7 +133,7 @@ def sensor_of(name: str) -> str:
 
 
 def is_ours(name: str) -> bool:
-    """Whether a method is one of this project."""
+    """Whether a method belongs to this project."""
     return name.removesuffix(TUNED) not in PACKAGES
 
 

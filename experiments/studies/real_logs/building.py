@@ -28,6 +28,7 @@ from experiments.judging.logs import (
     relations_of,
     track,
 )
+from experiments.runs.console import show
 from experiments.runs.row import Row
 from experiments.studies.real_logs.settings import KUEMMERLE, RESOLUTION_M
 from experiments.viewing.map import grid_along
@@ -137,4 +138,4 @@ def _grids(recording: Recording, **paths: Estimate) -> dict[str, NDArray[Any]]:
 
 if __name__ == "__main__":
     shown = ["log", "wheels", "method", "n_relations", "translation_mean_m", "translation_max_m"]
-    print(closed_loops()[0][shown].to_string(index=False))
+    show(closed_loops()[0][shown].to_string(index=False))

@@ -31,7 +31,7 @@ from experiments.judging.logs import (
     tuned_until_s,
     why_missing,
 )
-from experiments.judging.remake import Remake, whole
+from experiments.judging.remake import Cells, Remake, whole
 from experiments.judging.results import Profile, Results
 from experiments.runs.evaluate import run_over
 from experiments.runs.experiment import Experiment
@@ -105,7 +105,7 @@ def run(profile: Profile, out: Results, on_progress: Progress) -> None:
 REMADE = {"ate": 10.0, "wheels": 10.0, "lego": 10.0, "mrclam": 20.0}  # others take minutes
 
 
-def remake(table: str, row: Row) -> Remake | None:
+def remake(table: str, row: Cells) -> Remake | None:
     """The call that makes a row again; None without the logs."""
     makers = {"ate": rawseeds_ate, "wheels": wheels, "lego": lego_errors}
     if why_missing():

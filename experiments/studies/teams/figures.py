@@ -38,7 +38,7 @@ def drive(run: dict[str, Any]) -> Figure:
 
 
 def by_size(errors: pd.DataFrame) -> Figure:
-    """Error by the number of robots with and without sightings; and the ratio of the two."""
+    """Error against the number of robots with and without sightings, and the ratio of the two."""
     page, (left, right) = subplots(11.0, 4.6, 1, 2)
     linked = errors[errors["link"] == ALWAYS]
     for k, (name, part) in enumerate(linked.groupby("filter", sort=False)):

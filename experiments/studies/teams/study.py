@@ -21,7 +21,7 @@ from estimators.team import Communication, run_team
 from experiments.evaluation.metrics import score
 from experiments.judging.jobs import Progress, Tables, answer_of, tables_of
 from experiments.judging.logs import CALIBRATED_S, MRCLAM_6, calibrate_by_truth, known_start
-from experiments.judging.remake import Remake, agrees, whole
+from experiments.judging.remake import Cells, Remake, agrees, whole
 from experiments.judging.results import Profile, Results
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Row
@@ -67,7 +67,7 @@ def run(profile: Profile, out: Results, on_progress: Progress) -> None:
 REMADE = {"errors": 5.0, "mrclam": 120.0}
 
 
-def remake(table: str, row: Row) -> Remake | None:
+def remake(table: str, row: Cells) -> Remake | None:
     """The call that makes a row again; None without the log that it is from."""
     if table == "errors":
         return rows_of, (int(row["seed"]), row["filter"], row)
@@ -152,7 +152,7 @@ def _calibrated(recording: Recording) -> Recording:
     """
     found = calibrate_by_truth(recording)
     eyes = dict.fromkeys(("stereo", "robots"), found.sensors["stereo"])
-    own = dataclasses.replace(found, sensors=eyes).apply(recording)
+    own = dataclasses.replace(found, sensors=eyes).apply_to(recording)
     for name in eyes:
         camera: Any = own.sensors[name]
         log = own.log(name)

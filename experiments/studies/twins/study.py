@@ -9,7 +9,7 @@ import pandas as pd
 from experiments.evaluation.metrics import score
 from experiments.judging.jobs import Progress, Tables, tables_of
 from experiments.judging.logs import known_start, why_missing
-from experiments.judging.remake import Remake
+from experiments.judging.remake import Cells, Remake
 from experiments.judging.results import Profile, Results
 from experiments.runs.evaluate import run_over
 from experiments.runs.experiment import Experiment
@@ -60,7 +60,7 @@ def _planned() -> dict[str, dict[str, Experiment]]:
 REMADE = {"runs": 60.0}  # the others are made of it
 
 
-def remake(_table: str, row: Row) -> Remake | None:
+def remake(_table: str, row: Cells) -> Remake | None:
     """The call that makes a row again; None without the logs."""
     if why_missing():
         return None

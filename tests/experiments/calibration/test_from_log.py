@@ -132,7 +132,7 @@ def test_intervals_hold_what_was_planted(found):
 
 def test_a_calibrated_recording_reckons_better(log, found):
     off = []
-    for recording in (log, found.calibration.apply(log)):
+    for recording in (log, found.calibration.apply_to(log)):
         start = recording.truth_at(recording.frame_stamps[:1])[0]
         prior = Prior(recording.robot, recording.sensors, start, np.diag([1e-6] * 3))
         online = follow(Odometry(kr=K_M, kl=K_M), recording, prior, keep=())
@@ -233,7 +233,7 @@ def test_believed_by_a_run(tmp_path, log, found):
     with pytest.raises(InputError, match="set recording too"):
         Experiment.compose([given[1]])
     with pytest.raises(InputError, match="no readings of a sensor stereo"):
-        found.calibration.apply(log.without("stereo"))
+        found.calibration.apply_to(log.without("stereo"))
 
 
 def test_too_little_is_told(log):

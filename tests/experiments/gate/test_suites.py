@@ -166,7 +166,7 @@ def test_recordings_of_the_check_turn():
     suite = read_suite(suite_path("check"))
     for group, overrides in suite.overrides.items():
         seed = suite.first_seed
-        read = Experiment.compose(overrides).replace(seed=seed, world_seed=seed).recordings()
+        read = Experiment.compose(overrides).with_values(seed=seed, world_seed=seed).recordings()
         for recording in read.robots:
             assert recording.status == "ok"
             turned = np.abs(np.diff(np.unwrap(recording.truth.poses[:, 2]))).sum()

@@ -138,7 +138,7 @@ def test_figures_are_drawn_again_from_disk(results, monkeypatch, capsys):
     module.redraw(only=PAPER)
     assert path.exists()
     (results / "arrays" / f"{PAPER}_runs.npz").write_bytes(b"PK")
-    with pytest.raises(InputError, match=r"gil2008_runs\.npz: damaged .*--full --paper gil2008"):
+    with pytest.raises(InputError, match=r"gil2008_runs\.npz: damaged .*--paper gil2008 --full"):
         module.redraw(only=PAPER)
     (results / "arrays" / f"{PAPER}_runs.npz").unlink()
     with pytest.raises(InputError, match=r"gil2008_runs\.npz: missing"):
@@ -152,7 +152,7 @@ def test_figures_are_drawn_again_from_disk(results, monkeypatch, capsys):
             module.redraw(only=only)
 
 
-REMEDY = r"; run `estima reproduce --full --paper gil2008`$"
+REMEDY = r"; run `estima reproduce --paper gil2008 --full`$"
 
 
 @pytest.mark.parametrize(

@@ -19,6 +19,7 @@ from experiments.judging.claims_file import (
     write_claims,
     write_verdicts,
 )
+from experiments.judging.folders import findings
 from experiments.judging.results import Profile
 from experiments.judging.sentences import Conclusion
 from experiments.report import contents, leaderboard
@@ -119,7 +120,8 @@ def test_structure_that_readers_and_their_aids_rely_on(text):
     ids = [e["id"] for e in page.elements if "id" in e]
     assert len(ids) == len(set(ids))
     for link in page.all("a"):
-        assert link["href"].startswith("tables/") or link["href"][1:] in ids
+        elsewhere = link["href"].startswith(("tables/", "https://doi.org/"))
+        assert elsewhere or link["href"][1:] in ids
     assert len(page.all("table")) == len(page.all("caption"))
     assert all(cell["scope"] for cell in page.all("th"))
     assert page.all("html")[0]["lang"] == "en"
@@ -128,7 +130,7 @@ def test_structure_that_readers_and_their_aids_rely_on(text):
         assert len(image["alt"]) > 10
         assert image["src"].startswith("data:image/png;base64,")
         assert (image["width"], image["height"]) == ("600", "300")
-    assert "://" not in re.sub(r"base64,[^\"]*", "", text)  # nothing is fetched
+    assert "://" not in re.sub(r"base64,[^\"]*|<a href=\"https://doi.org/", "", text)  # no fetching
     assert "prefers-color-scheme: dark" in text
 
 
@@ -201,7 +203,7 @@ def test_origin_and_command_are_shown(text):
     sections = {e.get("aria-labelledby"): e["text"] for e in Outline(text).all("section")}
     assert "<i>quick profile, 12 s" in sections["puzzlebot2024"]
     assert "<i>fast" in sections["machine"]
-    assert "estima reproduce --full --paper gil2008" in sections["gil2008"]
+    assert "estima reproduce --paper gil2008 --full" in sections["gil2008"]
     assert "world: office" in sections["decristoforis2020"]  # its study's configuration
     assert np.__version__ in sections["machine"]
 
@@ -274,7 +276,9 @@ def test_a_damaged_figure_is_named(tmp_path, results):
 @pytest.mark.parametrize("paper", [*contents.PAPERS, *contents.OWN, "real_logs"])
 def test_findings_are_complete(paper):
     about = contents.findings(paper)
-    assert set(about) - {"unit"} == {"title", "about", "claims", "own", "sentences", "figures"}
+    kept = {"title", "source", "doi", "about", "claims", "own", "sentences", "figures"}
+    assert set(about) - {"unit"} == kept
+    assert bool(about["source"]) == (paper in contents.PAPERS)
     assert set(about["own"]) <= set(about["claims"])
     for name, figure in about["figures"].items():
         assert name.startswith(f"{paper}_")
@@ -380,11 +384,11 @@ def test_the_first_screen_has_the_leaderboard_by_world(tmp_path):
     assert leaderboard.by_world(path) == {}
 
 
-def test_the_first_screen_names_the_paper_that_holds_best():
-    good, bad, open_ = Verdict.REPRODUCED, Verdict.NOT_REPRODUCED, Verdict.UNDECIDED
-    tallies = {"a": [(good, 3), (bad, 1)], "b": [(good, 6), (bad, 2)], "c": [(open_, 6)], "d": []}
-    assert contents.papers_holding_best(tallies) == [("a", 3, 4), ("b", 6, 8)]
-    assert contents.papers_holding_best({"c": [(open_, 6)], "d": []}) == []
+def test_the_report_names_the_source_of_each_paper(text):
+    shown = [element["text"] for element in Outline(text).elements]
+    for paper in contents.PAPERS:
+        assert any(findings(paper)["source"] in words for words in shown), paper
+    assert 'href="https://doi.org/10.33414/rtyc.37.134-145.2020"' in text
 
 
 def test_the_first_screen_has_the_leaderboard_on_lasers(tmp_path):

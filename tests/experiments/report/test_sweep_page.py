@@ -8,11 +8,12 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from experiments.cli import sweep
 from experiments.report import of_sweep, sweep_page
 from experiments.report.sweep_page import extremes, picture_path, write_sweep_page
-from experiments.sweeps.again import noted_config_dir
 from experiments.sweeps.averages import averages
 from experiments.sweeps.collect import with_answers
+from experiments.sweeps.commands import noted_config_dir
 from sim.errors import InputError
 from tests.experiments.sweeps.test_collect import many
 from tests.fixtures import browser
@@ -57,22 +58,22 @@ def test_a_sweep_without_a_sound_run_says_why_and_proposes_what_works(
     tmp_path, monkeypatch, capsys
 ):
     table = rows()
-    monkeypatch.setattr(of_sweep, "collect", lambda *_args, **_options: table)
-    of_sweep.after_sweep(tmp_path / "mine", len(table))
+    monkeypatch.setattr(sweep, "collect", lambda *_args, **_options: table)
+    sweep.show_sweep(tmp_path / "mine", len(table))
     assert "estima table mine --against m00 -o" in capsys.readouterr().out
     first = table["choice.estimator"] == "m00"
     bad = table.assign(status=table["status"].mask(first, "failed"))
-    monkeypatch.setattr(of_sweep, "collect", lambda *_args, **_options: bad)
-    of_sweep.after_sweep(tmp_path / "mine", len(bad))
+    monkeypatch.setattr(sweep, "collect", lambda *_args, **_options: bad)
+    sweep.show_sweep(tmp_path / "mine", len(bad))
     assert "--against m00" not in capsys.readouterr().out
     alone = table[table["choice.estimator"] == "m00"]
-    monkeypatch.setattr(of_sweep, "collect", lambda *_args, **_options: alone)
-    of_sweep.after_sweep(tmp_path / "mine", len(alone))
+    monkeypatch.setattr(sweep, "collect", lambda *_args, **_options: alone)
+    sweep.show_sweep(tmp_path / "mine", len(alone))
     assert "estima table mine -o" in capsys.readouterr().out
     table[["status", "status_detail"]] = "failed", "odd"
     table.loc[3:, "status_detail"] = [f"late at {i}.5 s" for i in range(len(table) - 3)]
-    monkeypatch.setattr(of_sweep, "collect", lambda *_args, **_options: table)
-    of_sweep.after_sweep(tmp_path / "mine", len(table))
+    monkeypatch.setattr(sweep, "collect", lambda *_args, **_options: table)
+    sweep.show_sweep(tmp_path / "mine", len(table))
     said = capsys.readouterr().out
     assert f"{len(table)} runs failed, most often ({len(table) - 3}) so: late at ... s" in said
     assert "estima table mine --rows" in said
@@ -116,7 +117,7 @@ def choose(tab, name, value):
 
 
 SAID = "byId('said').textContent"
-Y = "position RMSE, best answer, m"
+Y = "position RMSE, m"
 
 
 def drawn(tab, *names):

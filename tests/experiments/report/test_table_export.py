@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from experiments.cli.tables import export_table
 from experiments.report.export import export, read_table, to_latex, to_markdown
 from experiments.runs.row import write_frame
 from sim.errors import InputError
@@ -52,18 +53,18 @@ def test_two_tables_never_become_one_file(tmp_path):
         path.parent.mkdir()
         path.write_text("x\n1\n")
     with pytest.raises(InputError, match=r"a/t\.csv and .*b/t\.csv would both become .*t\.md"):
-        export(paths, "markdown", tmp_path / "out", 4)
+        list(export(paths, "markdown", tmp_path / "out", 4))
     assert not (tmp_path / "out").exists()
-    export(paths, "markdown", None, 4)  # on paper both have their place
+    list(export(paths, "markdown", None, 4))  # on paper both have their place
 
 
 def test_letters_that_the_output_lacks_are_named(tmp_path, monkeypatch):
     path = tmp_path / "t.csv"
     path.write_text("name\n\u00e9\n", encoding="utf-8")
     monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(io.BytesIO(), encoding="ascii"))
-    with pytest.raises(InputError, match=r"ascii, lacks '\\xe9'; write files, or set"):
-        export([path], "markdown", None, 4)
-    export([path], "markdown", tmp_path, 4)
+    with pytest.raises(InputError, match=r"ascii, lacks '\\xe9' .*; write files, or set"):
+        export_table([path], digits=4)
+    list(export([path], "markdown", tmp_path, 4))
     assert "\u00e9" in (tmp_path / "t.md").read_text(encoding="utf-8")
 
 
@@ -72,7 +73,7 @@ def test_a_file_that_is_no_table_is_refused_without_advice_to_delete_it(tmp_path
     (tmp_path / "README.md").write_text("# Read me\n")
     (tmp_path / "damaged.csv").write_text('a,b\n1,2\n3,4,5,6\n"')
     with pytest.raises(InputError, match=f"{name}.*needs a CSV or Parquet table") as refusal:
-        export([tmp_path / name], "markdown", None, 4)
+        list(export([tmp_path / name], "markdown", None, 4))
     assert "delete" not in str(refusal.value)
     assert "\n" not in str(refusal.value)
 

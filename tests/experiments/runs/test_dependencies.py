@@ -139,11 +139,11 @@ def test_a_row_is_stale_once_anything_of_ones_own_has_changed(own):
 def test_a_second_run_of_the_same_process_depends_on_the_same(own):
     experiment, folder = own
     make_row(experiment, folder)
-    make_row(experiment.replace(seed=1), folder)  # what is cached or imported is not seen again
+    make_row(experiment.with_values(seed=1), folder)  # what is cached or imported is not seen again
     assert len(list((folder / "dependencies").iterdir())) == 1
     (folder.parents[2] / "two.txt").write_text("other")
     assert not is_done(experiment, folder)
-    assert not is_done(experiment.replace(seed=1), folder)
+    assert not is_done(experiment.with_values(seed=1), folder)
 
 
 def seen_by(*overrides):

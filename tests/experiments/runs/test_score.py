@@ -136,7 +136,7 @@ def test_what_was_scored_is_said():
     )  # fmt: skip
     assert turned.moved_by[2] == pytest.approx(-np.pi / 2)
     assert turned.estimate.covariances[0] == pytest.approx(np.diag([1.0, 4.0, 1.0]))
-    with pytest.raises(InputError, match=r"0 of 50 poses meet the truth.*set --offset"):
+    with pytest.raises(InputError, match=r"0 of 50 poses meet the truth.*set an offset"):
         match_and_align(recording, late, Scoring(offset_s=1e4))
 
 

@@ -21,7 +21,7 @@ def shortened(experiment):
     for key, most in (("n_particles", 20), ("max_particles", 300), ("min_particles", 100)):
         if key in estimator:
             estimator[key] = min(estimator[key], most)
-    return experiment.replace(route=route, estimator=estimator, repeats=1)
+    return experiment.with_values(route=route, estimator=estimator, repeats=1)
 
 
 def runs_of(name, folder):

@@ -200,7 +200,7 @@ def test_a_mean_of_two_is_drawn_with_both_and_without_an_interval():
     np.testing.assert_allclose(np.sort(dots.get_ydata()), np.sort(two["ate_rmse_m"]))
     assert len(mean.get_ydata()) == 2
     note = page.get_suptitle().replace("\n", " ")
-    assert note.endswith("pooled by squares first; small dots: both of two")
+    assert note.endswith("each the RMS of its repeats; small dots: both of two")
     three = sweep_figure(rows(), "robot.kr", "ate_rmse_m", "choice.estimator")
     assert "[95 % interval]" in three.get_suptitle()
     assert "dots" not in three.get_suptitle()

@@ -33,7 +33,7 @@ def test_a_million_runs_are_planned_as_each_of_them_alone():
             [f"seed={i // 1000}", f"robot.kr={c['robot']['kr']}", "robot.kl=${robot.kr}",
              "simulation.physics=kinematic"]
         )  # fmt: skip
-        assert c == alone.replace(picture=False).config
+        assert c == alone.with_values(picture=False).config
         assert int(alone.key, 16) == every.keys[i]
 
 
@@ -90,10 +90,10 @@ def test_unknown_keys_and_options_are_refused():
 
 def test_keys_depend_on_the_settings():
     experiment = Experiment.compose([])
-    assert experiment.replace(name="other").key == experiment.key
-    assert experiment.replace(seed=5).key != experiment.key
+    assert experiment.with_values(name="other").key == experiment.key
+    assert experiment.with_values(seed=5).key != experiment.key
     with pytest.raises(InputError, match=r"nowhere\.npz"):
-        _ = experiment.replace(recording="nowhere.npz").recording_key
+        _ = experiment.with_values(recording="nowhere.npz").recording_key
 
 
 def test_packing_keeps_recordings_together():
@@ -126,9 +126,9 @@ def test_wrong_sweeps_end_in_one_line(arguments, words):
 def test_the_last_value_of_a_key_decides_a_sweeps_own_name():
     made = plan.make_plan(["seed=0,1"])
     orders = (["robot.kr=1e-5", "robot.kr=1e-4"], ["robot.kr=1e-4", "robot.kr=1e-5"])
-    forward, back = (launch._name(made, ["seed=0,1", *order], None) for order in orders)
+    forward, back = (made.name_by(["seed=0,1", *order], None) for order in orders)
     assert forward != back
-    assert forward == launch._name(made, ["robot.kr=1e-4", "seed=0,1"], None)
+    assert forward == made.name_by(["robot.kr=1e-4", "seed=0,1"], None)
 
 
 @pytest.mark.parametrize(
@@ -136,7 +136,7 @@ def test_the_last_value_of_a_key_decides_a_sweeps_own_name():
     [
         (["-m", "hydra/sweeper=optuna"], ["hydra/sweeper", "every combination"]),
         (["-m", "hydra.sweep.dir=/tmp/x"], ["hydra.sweep.dir", "set name"]),
-        (["hydra.run.dir=/tmp/x"], ["hydra.run.dir", "--results"]),
+        (["hydra.run.dir=/tmp/x"], ["hydra.run.dir", "ESTIMA_RESULTS"]),
         (["hydra.verbose=true"], ["hydra.verbose", "nothing is logged"]),
         (["-m", "robot.kr=interval(0,1)"], ["interval(0,1)", "range(0,1,0.1)"]),
         (["-m", "route=glob(nothing*)"], ["empty range or list"]),

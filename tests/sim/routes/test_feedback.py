@@ -174,7 +174,7 @@ def test_an_estimator_on_board_steers_by_what_it_makes_of_the_recording():
     again = [step(frame) for frame in recording.frames()]
     np.testing.assert_array_equal(again[: len(believed)], believed)
     assert np.hypot(*(again - truth.poses)[:, :2].T).max() < 0.02
-    by_truth = experiment.replace(route={**experiment.config["route"], "feedback": "truth"})
+    by_truth = experiment.with_values(route={**experiment.config["route"], "feedback": "truth"})
     assert by_truth.recording_key != experiment.recording_key
 
 
