@@ -38,7 +38,8 @@ def write_report(results: Path, on_progress: Callable[[float], None] = lambda _:
     if found["missing"]:
         warn(
             f"{results / 'claims.csv'}: no verdict on {', '.join(found['missing'])}, though others "
-            f"of the paper have one; `git checkout results/claims.csv` or `{reproduce_command(None)}`"
+            "of the paper have one; `git checkout results/claims.csv` or "
+            f"`{reproduce_command(None)}`"
         )
     path = results / "report.html"
     write_text(path, render("page.html", **found))
