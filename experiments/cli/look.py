@@ -13,6 +13,7 @@ from experiments.cli.flags import ConfigDir
 from experiments.runs import columns, paths
 from experiments.runs.console import show
 from sim.errors import require
+from sim.files import read_text
 
 
 def options(
@@ -74,7 +75,7 @@ def _file_of(group: str, name: str, config_dir: Path | None) -> Path:
 
 def _about(group: str, name: str, config_dir: Path | None) -> str:
     """What an option is: the first sentence of the comment at the head of its YAML."""
-    lines = _file_of(group, name, config_dir).read_text(encoding="utf-8").splitlines()
+    lines = read_text(_file_of(group, name, config_dir)).splitlines()
     head = itertools.takewhile(lambda line: line.startswith("#"), lines)
     words = " ".join(line.lstrip("# ") for line in head if "@package" not in line)
     return words.partition(". ")[0].removesuffix(".")
@@ -89,7 +90,7 @@ def _describe(group: str, name: str, config_dir: Path | None) -> None:
     known = f"no {group} named {name}; there are: {', '.join(names)}"
     require(name in names or group in _groups_of(name, config_dir), known)
     if group == "study":
-        show(_file_of(group, name, config_dir).read_text(encoding="utf-8").rstrip())
+        show(read_text(_file_of(group, name, config_dir)).rstrip())
     else:
         show(describe_option(group, name, searched(config_dir)))
 

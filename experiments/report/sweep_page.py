@@ -97,6 +97,7 @@ def write_sweep_page(
     text = render(
         "sweep.html",
         name=name,
+        called=shlex.quote(name),
         n_runs=len(table),
         unfinished=unfinished_sweeps(folder),
         controls=_controls(every, drawn_by, settings, metrics),
@@ -112,7 +113,7 @@ def write_sweep_page(
                 "metrics": [_metric(every[c], c, place) for c in metrics],
                 "revised": (every[PATH] == "revised").astype(int).tolist(),
                 "t975": stats.t.ppf(0.975, np.arange(1, 200)).round(4).tolist(),
-                "name": name,
+                "called": shlex.quote(name),
                 "options": options,
                 "pictures": pictures,
                 "keys": [short_key(row) for _, row in table[["run_key", REPEAT]].iterrows()],

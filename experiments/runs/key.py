@@ -13,6 +13,7 @@ from experiments.runs.row import Row
 from experiments.runs.schema import SIMULATED_KEYS, Config, Leaf, leaves
 from experiments.runs.version import code_version
 from sim.errors import InputError
+from sim.files import require_file
 
 _NOT_IN_KEY = ("name", "picture", "recording")
 _TEAM_KEYS = ("size", "robots")  # of the key `team`, those that decide what is read
@@ -24,8 +25,9 @@ def digest_of(path: Path) -> str:
     Raises
     ------
     InputError
-        If it cannot be read.
+        If it cannot be read, or is not a file.
     """
+    require_file(path)
     try:
         return hashlib.sha256(path.read_bytes()).hexdigest()
     except OSError as error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import functools
 from collections.abc import Callable, Mapping
@@ -12,10 +13,12 @@ from typing import Any, Self, cast
 import numpy as np
 
 from estimators.base import Estimator, Prior, TeamEstimator
+from estimators.programs.host import Isolated
+from experiments.evaluation.metrics import SCORED_EXTRAS
 from experiments.runs.cache import fetch_or_make
 from experiments.runs.calibration import read_calibration
 from experiments.runs.console import warn
-from experiments.runs.dependencies.recorder import Digests, recorded
+from experiments.runs.dependencies.recorder import Digests, note_unloaded, recorded
 from experiments.runs.key import recording_key
 from experiments.runs.schema import (
     SIMULATED_KEYS,
@@ -74,6 +77,11 @@ class Objects:
         """Digest of the settings that decide the recording's bits, or of its file."""
         return recording_key(self.config)
 
+    @property
+    def isolated(self) -> bool:
+        """Whether the estimator runs in a child process; a program is one anyway."""
+        return bool(self.config.get("isolated")) and "command" not in self.config["estimator"]
+
     def world(self) -> World:
         """Make the world, from its own stream."""
         rng = stream(self.config["world_seed"], "world", key="world_seed")
@@ -91,7 +99,12 @@ class Objects:
 
     def estimator(self) -> Estimator:
         """Make the estimator: anything with `reset` and `step`."""
-        estimator: Estimator = self.own_estimator or make(self.config["estimator"], "estimator")
+        settings = copy.deepcopy(self.config["estimator"])
+        if self.isolated:
+            target = str(self.config["estimator"].get("_target_"))
+            note_unloaded(target.rpartition(".")[0], self.config["estimator"])
+            return Isolated(settings, [*SCORED_EXTRAS, *self.config["keep"]])
+        estimator: Estimator = self.own_estimator or make(settings, "estimator")
         for method in ("reset", "step"):
             require(
                 callable(getattr(estimator, method, None)),
@@ -339,9 +352,8 @@ class Objects:
             return None
         if is_grid_file(wanted):
             return grid_file.read_grid(wanted)
-        return required(
-            recording.world, "prior.map=world, but the recording has no map; set prior.map=none"
-        )
+        missing = "prior.map=world, but the recording has no map; set prior.map=none"
+        return required(recording.world, missing).as_map()
 
 
 def _true_start(recording: Recording) -> Array:

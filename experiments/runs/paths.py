@@ -4,6 +4,7 @@ import os
 import re
 from pathlib import Path
 
+TRUST = "ESTIMA_TRUST"  # set by --trust: data may name code
 SOURCE = Path(__file__).resolve().parents[2]  # the clone, or the site-packages of a wheel
 
 

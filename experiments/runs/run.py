@@ -13,7 +13,7 @@ from estimators.base import Estimate
 from estimators.programs.program import ProgramError
 from experiments.runs import paths
 from experiments.runs.columns import COLUMNS, DEPENDENCIES, REVISED
-from experiments.runs.console import RunFailedError, progress, show
+from experiments.runs.console import RunFailedError, progress, show, warn
 from experiments.runs.dependencies.recorder import recorded
 from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
@@ -21,7 +21,7 @@ from experiments.runs.processes import hold_interrupts
 from experiments.runs.row import Outcome, Row
 from experiments.runs.store import keep_dependencies, write_run
 from experiments.trajectories.convert import write_estimate
-from sim.errors import require
+from sim.errors import InputError, require
 from sim.recording import Recording
 from sim.team import Team, save
 
@@ -93,18 +93,32 @@ def run_once(experiment: Experiment, draw: Draw, out: Path | None = None) -> lis
                 on_estimate=keep,
                 on_error=_trace,
             )
-    if found and experiment.config["picture"]:
-        draw(found, experiment, folder)
-    if found and out is not None:
-        write_estimate(out, found[0][1])
     kept = keep_dependencies(seen.digests(), folder.parent)
     rows = [row | {DEPENDENCIES: kept} for row in rows]
     written = (write_run(rows, folder.parent), folder / "run.png", out)
+    if found and out is not None:
+        write_estimate(out, found[0][1])
+    if found and experiment.config["picture"]:
+        _draw(draw, found, experiment, folder)
     _print(rows, [file for file in written if file is not None and file.exists()])
     for row in rows:
         if row["status"] == Outcome.FAILED:
             raise RunFailedError(f"{row['status_code']}: {row['status_detail']}")
     return rows
+
+
+def _draw(
+    draw: Draw, found: Sequence[tuple[Recording, Estimate]], experiment: Experiment, folder: Path
+) -> None:
+    """Draw a run whose results are on disk; a picture that fails is a warning."""
+    try:
+        draw(found, experiment, folder)
+    except InputError:  # a full disk, say
+        raise
+    except Exception as error:
+        (folder / "run.png").unlink(missing_ok=True)  # of a run before
+        why = " ".join(f"{type(error).__name__}: {error}".split())
+        warn(f"estima: the picture is not drawn ({why}); the results are kept")
 
 
 def expected_duration_s(experiment: Experiment) -> float | None:
@@ -127,7 +141,7 @@ def record(experiment: Experiment, out: Path) -> bool:
     return all(robot.status == "ok" for robot in made.robots)
 
 
-def _trace(error: Exception | SystemExit) -> None:
+def _trace(error: BaseException) -> None:
     """Print where an error came from, unless it is a program's, whose own message says so."""
     if not isinstance(error, ProgramError):
         traceback.print_exception(error)

@@ -30,6 +30,7 @@ from experiments.runs.row import (
     Outcome,
     Row,
     check_row,
+    check_table,
     concatenate,
     read_parquet,
     read_rows,
@@ -50,7 +51,7 @@ _BEGUN, _WHOLE, _CHANGES, _FAILED = b"b=+!"
 ENDED = (_WHOLE, _CHANGES, _FAILED)  # kinds of lines of runs that have ended
 KIND_AT = 9  # place of the kind in a line, after the checksum
 _STATUS = ["run_key", "status", "status_code", "status_detail", DEPENDENCIES, "code_version"]
-_KEY = re.compile("[0-9a-f]{16}")
+_KEY, _DIGEST = re.compile("[0-9a-f]{16}"), re.compile("[0-9a-f]{12}")
 _SMALL_BYTES, _MOST_SMALL = 2**22, 100  # small files are merged when there are more of them
 
 
@@ -138,11 +139,11 @@ def read_runs(path: Path) -> pd.DataFrame:
         If there are none, or a file is damaged or holds no rows.
     """
     tables = [t for file in _files(path) for t in _tables(file)] if path.is_dir() else []
+    table = concatenate(tables) if tables else read_rows(path)
+    require(len(table), f"{path}: a table of no rows; delete it")
+    check_table(table, path)
     if not tables:
-        table = read_rows(path)
-        require(len(table), f"{path}: a table of no rows; delete it")
         return table
-    table = concatenate(tables)
     run = [name for name in ("run_key", REPEAT, DEPENDENCIES) if name in table]
     if "status" not in table or len(run) < 2 or not table.duplicated(run).any():
         return table
@@ -174,13 +175,14 @@ def ended(folder: Path, prefix: str = "", damaged: Any = None) -> Outcomes:
         for table in tables:
             if not set(_STATUS) - {DEPENDENCIES} <= set(table.column_names):
                 continue
-            table = table.filter(fresh_rows(table.to_pandas(), folder))
+            frame = table.to_pandas()
+            check_table(frame, file)
+            table = table.filter(fresh_rows(frame, folder))
             keys = _as_numbers(table["run_key"])
             bad = np.asarray(table["status"].to_pandas() == Outcome.FAILED.value)
             if bad.any():
-                codes, details = (
-                    table[c].to_pandas()[bad] for c in ("status_code", "status_detail")
-                )
+                said = ("status_code", "status_detail")
+                codes, details = (table[c].to_pandas()[bad].fillna("") for c in said)
                 failed.update(zip(keys[bad].tolist(), codes + ": " + details, strict=True))
                 keys = keys[~np.isin(keys, keys[bad])]
             done.append(keys)
@@ -204,6 +206,8 @@ def keep_dependencies(digests: Digests, folder: Path) -> str:
 def stale_because(digest: str, folder: Path) -> list[str] | None:
     """What has changed of the dependencies of rows in a folder; None if they are not known."""
     path = _kept(folder, digest)
+    if not _DIGEST.fullmatch(digest):
+        return None
     try:
         require_file(path)
         kept = json.loads(path.read_text())
@@ -266,19 +270,19 @@ def journal_lines(content: bytes) -> Iterator[tuple[str, list[Row]]]:
             if isinstance(payload, str) and _KEY.fullmatch(payload):
                 yield payload, []
             continue
-        if not (isinstance(payload, list) and payload and all(map(_is_flat, payload))):
+        rows = payload if isinstance(payload, list) else []
+        if not rows or not all(isinstance(row, dict) for row in rows):
             continue
         if kind == _CHANGES:
-            payload = [{**basis, **changes} for changes in payload]
+            rows = [{**basis, **changes} for changes in rows]
         elif kind == _WHOLE:
-            basis, basis_crc = payload[0], crc
-        if all(isinstance(row.get("run_key"), str) for row in payload):
-            yield payload[0]["run_key"], payload
-
-
-def _is_flat(row: Any) -> bool:
-    """Whether something is a mapping to scalars."""
-    return isinstance(row, dict) and not any(isinstance(v, (list, dict)) for v in row.values())
+            basis, basis_crc = rows[0], crc
+        try:
+            for row in rows:
+                check_row(row)
+        except InputError:
+            continue
+        yield str(rows[0]["run_key"]), rows
 
 
 def has_checksum(path: Path) -> bool:

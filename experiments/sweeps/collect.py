@@ -24,7 +24,9 @@ from experiments.runs.console import pluralize, warn
 from experiments.runs.paths import results
 from experiments.runs.store import fresh_rows, read_runs, stale_because
 from experiments.runs.version import code_version
+from experiments.sweeps.commands import MOST_BYTES
 from sim.errors import InputError, printable, require
+from sim.files import read_text
 
 FEW = 12  # colours, and panels
 _TIMES = ["step_time_us", "cpu_time_us"]  # they differ from run to run
@@ -92,10 +94,8 @@ def _why_stale(table: pd.DataFrame, path: Path) -> str:
 
 def unfinished_sweeps(folder: Path) -> list[tuple[str, str]]:
     """Sweeps of a folder that have not ended: how many runs each has, and its command."""
-    texts = [
-        path.read_text(encoding="utf-8", errors="replace")
-        for path in sorted(folder.glob(UNFINISHED.format("*")))
-    ]
+    paths = sorted(folder.glob(UNFINISHED.format("*")))
+    texts = [read_text(path, MOST_BYTES) for path in paths]
     parts = [text.partition(" ") for text in texts]
     return [(n_runs, command.rstrip()) for n_runs, _, command in parts]
 

@@ -107,7 +107,7 @@ function pick({ row, runs = 1 }) {
   const picture = data.pictures[key];
   const made = document.createElement(picture ? "a" : "code");
   if (picture) made.href = picture;
-  made.textContent = picture ? "watch" : `estima view ${data.name}/${key}${data.options} -o run.html`;
+  made.textContent = picture ? "watch" : `estima view ${data.called}/${key}${data.options} -o run.html`;
   byId("picked").replaceChildren(`${named(row).map((pair) => pair.join(": ")).join(", ")}. `, made, " ");
   if (picture) return;
   const copy = document.createElement("button");

@@ -2,12 +2,12 @@
 
 import functools
 import hashlib
-import importlib
 import importlib.metadata
 import json
 import os
 import platform
 import shutil
+import stat
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -63,6 +63,8 @@ def digest_of(path: Path) -> str:
         If it cannot be read.
     """
     state = path.stat()
+    if not stat.S_ISREG(state.st_mode):  # a pipe would wait forever
+        raise OSError(f"{path}: not a file")
     return _digest(path, state.st_mtime_ns, state.st_size)
 
 
@@ -83,8 +85,13 @@ def package_version(name: str) -> str | None:
     """Version of the package that a top-level module belongs to, or of Python; None if unknown."""
     if name == "python":
         return ".".join(platform.python_version_tuple()[:2])
-    with suppress(importlib.metadata.PackageNotFoundError):
+    with suppress(importlib.metadata.PackageNotFoundError, ValueError):
         return importlib.metadata.version(name)
-    with suppress(ImportError):
-        return getattr(importlib.import_module(name), "__version__", None)
+    with suppress(importlib.metadata.PackageNotFoundError, IndexError):
+        return importlib.metadata.version(_distributions().get(name, [])[0])
     return None
+
+
+@functools.cache
+def _distributions() -> Mapping[str, list[str]]:
+    return importlib.metadata.packages_distributions()

@@ -8,6 +8,7 @@ does not count. A name is a path below the checkout (`sim/se2.py`), below the re
 import builtins
 import functools
 import hashlib
+import importlib.machinery
 import importlib.util
 import json
 import os
@@ -22,7 +23,7 @@ from types import FrameType, ModuleType
 from typing import Any
 
 from experiments.runs.dependencies.digests import digest_of, name_of, package_version
-from experiments.runs.dependencies.sources import keep_sources, read_source
+from experiments.runs.dependencies.sources import all_imports, keep_sources, read_source
 from experiments.runs.paths import SOURCE
 
 Digests = Mapping[str, str]  # of each dependency, by its name
@@ -91,6 +92,45 @@ def note(digests: Digests) -> None:
     """Add to what is being recorded what was recorded elsewhere."""
     for recorder in _WATCH.recorders:
         recorder.noted.update(digests)
+
+
+def note_unloaded(module: str, settings: Mapping[str, Any]) -> None:
+    """Add a module that another process loads: its sources, found without running them.
+
+    Parameters
+    ----------
+    settings
+        Its options; the files that they name count too.
+    """
+    found: dict[str, str] = {}
+    todo, seen = {module}, set[str]()
+    while todo:
+        name = todo.pop()
+        file = None if name in seen else _find_source(name)
+        seen.add(name)
+        if file is not None and not _is_installed(str(file)):
+            text = file.read_bytes()
+            found[name_of(file)] = read_source(text).digest
+            package = name if file.name == "__init__.py" else name.rpartition(".")[0]
+            todo.update({name.rpartition(".")[0], *all_imports(text, package)} - {""})
+    for value in settings.values():
+        for word in value if isinstance(value, list) else [value]:
+            with suppress(OSError, ValueError):
+                if isinstance(word, str) and Path(word).is_file():
+                    found[name_of(Path(word).absolute())] = digest_of(Path(word))
+    note(found)
+
+
+def _find_source(module: str) -> Path | None:
+    """File of a module, without importing the packages that it is in."""
+    places: Any = None
+    for depth in range(1, module.count(".") + 2):
+        part = ".".join(module.split(".")[:depth])
+        spec = importlib.machinery.PathFinder.find_spec(part, places)
+        if spec is None:
+            return None
+        places = spec.submodule_search_locations
+    return Path(spec.origin) if spec is not None and str(spec.origin).endswith(".py") else None
 
 
 def note_part(name: str, digests: Digests, seconds: float) -> None:

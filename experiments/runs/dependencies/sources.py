@@ -7,6 +7,7 @@ digest of its text.
 import ast
 import functools
 import hashlib
+import importlib.util
 import json
 from collections.abc import Iterator
 from contextlib import suppress
@@ -82,6 +83,26 @@ def _without_docstrings(tree: ast.Module) -> ast.Module:
         if isinstance(body := getattr(node, "body", None), list):
             node.body = [each for each in body if not _is_docstring(each)]  # type: ignore[attr-defined]
     return tree
+
+
+def all_imports(text: bytes, package: str) -> set[str]:
+    """Modules, and names that may be modules, of all import statements of a source.
+
+    Parameters
+    ----------
+    package
+        In which relative ones are found.
+    """
+    found: set[str] = set()
+    with suppress(SyntaxError, ValueError, RecursionError):
+        for node in ast.walk(ast.parse(text)):
+            if isinstance(node, ast.Import | ast.ImportFrom):
+                found |= set(_imports([node]))
+    resolved = set()
+    for name in found:
+        with suppress(ImportError):
+            resolved.add(importlib.util.resolve_name(name, package))
+    return resolved
 
 
 def _is_docstring(node: Any) -> bool:

@@ -224,6 +224,17 @@ def test_recording_costs_little():
     assert (time.process_time() - begun) / 100 < 2e-3  # with room for a busy machine
 
 
+def test_code_of_an_isolated_estimator_counts_though_it_is_not_loaded(own):
+    experiment, folder = own
+    with recorded() as found:
+        experiment.with_values(isolated=True).estimator()
+    place = folder.parents[2]
+    names = {str(place / name) for name in FILES if name.endswith((".py", ".txt"))}
+    assert names - set(found.digests()) == {str(place / "rows_sensor.py")}
+    assert "rows_mine" not in sys.modules
+    assert "estimators/odometry.py" in found.digests()
+
+
 def test_what_a_source_says():
     said = sources.read_source(b'"""Doc."""\nx = 1  # one\ndef f():\n    "does"\n    return x\n')
     same = sources.read_source(b'x = 1\n\n\n\ndef f():\n    """Does it."""\n    return (x)\n')
@@ -245,3 +256,7 @@ def test_what_was_damaged_is_not_believed(tmp_path):
         path.write_text(text)
         assert store.stale_because(digest, tmp_path) is None
     assert recorder.digest_of_all({}) != digest
+    assert store.stale_because("../../x", tmp_path) is None
+    assert digests.package_version("rows_never_imported") is None
+    assert digests.present_digest("/dev/zero") is None
+    assert digests.present_digest("package ../x") is None
