@@ -428,7 +428,7 @@ def _following(tree: Any) -> dict[Leaf, list[Leaf]] | None:
 
 def _decides_more(leaf: Leaf) -> bool:
     """Whether a leaf decides more than its own value: a recording, code, or how rays are cast."""
-    return leaf[0] in ("recording", "simulation") or leaf[-1] == "_target_"
+    return leaf[0] in ("recording", "simulation") or leaf[-1] in ("_target_", "command")
 
 
 def _sums(first: str, steps: Sequence[Digests]) -> Digests:

@@ -123,14 +123,16 @@ def note_unloaded(module: str, settings: Mapping[str, Any]) -> None:
 
 def _find_source(module: str) -> Path | None:
     """File of a module, without importing the packages that it is in."""
-    places: Any = None
+    places, found = None, ""
     for depth in range(1, module.count(".") + 2):
+        if depth > 1 and places is None:  # a module that is not a package
+            return None
         part = ".".join(module.split(".")[:depth])
         spec = importlib.machinery.PathFinder.find_spec(part, places)
         if spec is None:
             return None
-        places = spec.submodule_search_locations
-    return Path(spec.origin) if spec is not None and str(spec.origin).endswith(".py") else None
+        places, found = spec.submodule_search_locations, spec.origin or ""
+    return Path(found) if found.endswith(".py") else None
 
 
 def note_part(name: str, digests: Digests, seconds: float) -> None:
@@ -258,15 +260,17 @@ def _caller() -> str:
 def _reader() -> str:
     """Module from elsewhere that reads a file, or any that reads one as it is loaded.
 
-    A script that calls us is not what reads.
+    A program that calls the runner is not what reads.
     """
     for frame in _frames():
         name = str(frame.f_globals.get("__name__", ""))
-        if name in ("__main__", "__mp_main__"):
+        if name in ("__main__", "__mp_main__", __name__):
             continue
         kind = _kind(name)
         if kind == "own" or (kind == "house" and frame.f_code.co_name == "<module>"):
             return name
+        if name.startswith("experiments."):
+            break
     return ""
 
 
