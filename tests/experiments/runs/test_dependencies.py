@@ -226,6 +226,8 @@ def test_recording_costs_little():
 
 def test_code_of_an_isolated_estimator_counts_though_it_is_not_loaded(own):
     experiment, folder = own
+    for name in [name for name in sys.modules if name.startswith("rows_")]:
+        del sys.modules[name]
     with recorded() as found:
         experiment.with_values(isolated=True).estimator()
     place = folder.parents[2]
