@@ -100,6 +100,15 @@ function draw() {
   });
 }
 
+// The intervals of a sweep that ran until it was decided, in the colours and type of the other chart.
+let drawnNarrowing;
+function drawNarrowing() {
+  if (!data.narrowing) return;
+  const spec = { ...structuredClone(data.narrowing), config: data.spec.config };
+  spec.spec.width = Math.max(120, byId("narrowing").parentElement.clientWidth - 110);
+  drawnNarrowing = vegaEmbed("#narrowing", spec, { ast: true, renderer: "svg", actions: false });
+}
+
 // What a click on a run's dot offers: its picture, or the command that draws it.
 function pick({ row, runs = 1 }) {
   if (row === undefined || runs > 1) return;
@@ -138,7 +147,9 @@ function showExtremes() {
 }
 
 draw();
+drawNarrowing();
 byId("chosen").addEventListener("change", draw);
 addEventListener("resize", draw);
+addEventListener("resize", drawNarrowing);
 byId("of").addEventListener("change", showExtremes);
 document.addEventListener("click", copied);
