@@ -29,12 +29,13 @@ from experiments.evaluation.metrics import (
     longest_pause_s,
     score,
 )
-from experiments.runs.bounds import bound_columns
+from experiments.evaluation.recording_bound import bound_recording, bound_scores
 from experiments.runs.columns import OF_THE_RUN, REVISED, Average, average_of
 from experiments.runs.experiment import Experiment
 from experiments.runs.objects import Objects
 from experiments.runs.processes import is_interrupt
 from experiments.runs.row import GAP, Outcome, Row, Status
+from experiments.runs.schema import is_ours
 from experiments.runs.seeds import stream
 from sim.arrays import Array
 from sim.errors import InputError, require, required
@@ -43,6 +44,7 @@ from sim.sensors import RobotCamera
 from sim.team import Team
 
 _ADDED = ("stamps_scored", "stamps_left_out", "step_time_us")  # over the robots
+_SENSORS = ("laser", "stereo", "robots")  # options of our methods that name one
 _STREAMS = 100  # of a run's filters
 REMARKED_PAUSE_S = 1.0  # without a pose
 _SPARSE = 5.0  # times the longest step of the recording: a path that chooses its poses
@@ -136,9 +138,18 @@ def _bounds(
     experiment: Experiment, recording: Recording, _: Estimate, revised: Estimate | None
 ) -> Row:
     """Columns of what no method can beat."""
-    prior, after_s = experiment.prior(recording), experiment.config["scoring"]["after_s"]
+    settings = experiment.config["estimator"]
+    named = [settings[option] for option in _SENSORS if settings.get(option) is not None]
+    read = named if named and is_ours(settings) else recording.sensors  # of a stranger, all
     with limit_blas():
-        return {**bound_columns(experiment, recording, prior, revised is not None, after_s)}
+        bound = bound_recording(recording, experiment.prior(recording), read)
+    if bound is None:
+        return {}
+    begin_s = recording.frame_stamps[0] + experiment.config["scoring"]["after_s"]
+    counted = recording.frame_stamps >= begin_s
+    row: Row = {**bound_scores(bound.online[counted])}
+    last = bound_scores(bound.revised[counted]) if revised is not None else {}
+    return row | {f"{REVISED}{name}": value for name, value in last.items()}
 
 
 def runner(

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-import experiments.runs.bounds as bounds
+import experiments.evaluation.recording_bound as bounds
 from estimators.base import Belief
 from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
@@ -77,14 +77,14 @@ def test_no_bound_over_a_real_log_or_another_robot():
 
     def columns(**changed):
         other = dataclasses.replace(recording, **changed)
-        return bounds.bound_columns(experiment, other, prior, False, 0.0)
+        return bounds.bound_recording(other, prior, ["stereo"])
 
-    assert columns()
+    assert columns() is not None
     truth, robot = recording.known_truth, recording.config["robot"]
-    assert not columns(truth=None)
-    assert not columns(truth=dataclasses.replace(truth, wheel_travel_m=np.zeros((0, 2))))
-    assert not columns(config={})
-    assert not columns(config={"robot": {**robot, "_target_": "elsewhere.Robot"}})
+    assert columns(truth=None) is None
+    assert columns(truth=dataclasses.replace(truth, wheel_travel_m=np.zeros((0, 2)))) is None
+    assert columns(config={}) is None
+    assert columns(config={"robot": {**robot, "_target_": "elsewhere.Robot"}}) is None
 
 
 def test_bound_is_made_once_a_recording(monkeypatch):

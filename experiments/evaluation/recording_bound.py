@@ -1,4 +1,4 @@
-"""The bound of a run's recording as columns, beside the errors of its estimates.
+"""The bound on the errors over a recording, beside which the estimates' own stand.
 
 What is bounded is the error of a method that knows the law of the wheels and of the sensors, their
 true figures, the start within its prior, and which landmark is which. Per recording the information
@@ -11,7 +11,7 @@ landmarks are *not* seen, or which beams return nothing, tells nothing.
 """
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -25,17 +25,12 @@ from experiments.evaluation.sensor_information import (
     motion_terms,
     stereo_information,
 )
-from experiments.runs.columns import REVISED
-from experiments.runs.objects import Objects
-from experiments.runs.schema import is_ours
 from sim.arrays import Array, Ints
 from sim.recording import Recording
 from sim.robot.base import robot_from_config
 from sim.robot.drive import DifferentialDrive
 from sim.sensors import Encoder, Laser, Sensor, StereoCamera
 from sim.worlds.world import World
-
-_NAMING = ("laser", "stereo", "robots")  # options of our methods that name a sensor
 
 
 @dataclass(frozen=True)
@@ -49,49 +44,36 @@ class _Known:
     recording: Recording = field(compare=False, repr=False)
 
 
-def bound_columns(
-    experiment: Objects, recording: Recording, prior: Prior, revised: bool, after_s: float
-) -> dict[str, float]:
-    """Columns `bound_rmse_m` and `bound_heading_rad`, and those of the revised path if it has one.
+def bound_recording(recording: Recording, prior: Prior, names: Iterable[str]) -> PathBound | None:
+    """Bound at each Frame of a recording; it is made once for several runs.
 
-    Empty where there is no bound: over a recording that was not simulated, without a start, of a
+    None where there is no bound: over a recording that was not simulated, without a start, of a
     robot or a sensor of another law, with a laser but without a map, and without sensors at all.
 
     Parameters
     ----------
-    after_s
-        Frames of the first seconds do not count, as in `experiments.evaluation.metrics.score`.
+    names
+        Sensors that are read.
     """
-    names = _sensors_read(experiment, recording)
-    sensors = [recording.sensors[name] for name in names]
+    read = tuple(name for name in names if not isinstance(recording.sensors.get(name), Encoder))
+    sensors = [recording.sensors.get(name) for name in read]
     blind = any(isinstance(sensor, Laser) for sensor in sensors) and prior.map is None
     if blind or prior.covariance is None or not _is_known(recording, sensors):
-        return {}
+        return None
     start, landmarks = prior.covariance.tobytes(), isinstance(prior.map, World)
-    path = _bound(_Known(recording.checksum, names, start, landmarks, recording))
-    counted = recording.frame_stamps >= recording.frame_stamps[0] + after_s
-    columns = _pooled("", path.online[counted])
-    return columns | (_pooled(REVISED, path.revised[counted]) if revised else {})
+    return _bound(_Known(recording.checksum, read, start, landmarks, recording))
 
 
-def _pooled(prefix: str, covariances: Array) -> dict[str, float]:
-    """Root mean squares over the Frames."""
+def bound_scores(covariances: Array) -> dict[str, float]:
+    """Root mean squares of bounds (T, 3, 3) over Frames, as columns of a row."""
     x, y, heading = np.diagonal(covariances, axis1=1, axis2=2).mean(axis=0)
     return {
-        f"{prefix}bound_rmse_m": float(np.sqrt(x + y)),
-        f"{prefix}bound_heading_rad": float(np.sqrt(heading)),
+        "bound_rmse_m": float(np.sqrt(x + y)),
+        "bound_heading_rad": float(np.sqrt(heading)),
     }
 
 
-def _sensors_read(experiment: Objects, recording: Recording) -> tuple[str, ...]:
-    """Sensors that the estimator reads; all of them if its options do not say."""
-    settings: Mapping[str, Any] = experiment.config["estimator"]
-    given = [settings[option] for option in _NAMING if settings.get(option) is not None]
-    named = given if given and is_ours(settings) else recording.sensors
-    return tuple(name for name in named if not isinstance(recording.sensors[name], Encoder))
-
-
-def _is_known(recording: Recording, sensors: list[Sensor]) -> bool:
+def _is_known(recording: Recording, sensors: list[Sensor | None]) -> bool:
     """Whether the law of the wheels and of the sensors is known, and the sensors see a world."""
     truth, made_with = recording.truth, recording.config.get("robot")
     if truth is None or truth.world is None or not len(truth.wheel_travel_m):
