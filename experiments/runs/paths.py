@@ -1,5 +1,6 @@
 """Where the package keeps its own data, and where results go."""
 
+import itertools
 import os
 import re
 from pathlib import Path
@@ -29,6 +30,21 @@ def option_names(group: str, folder: Path | None = None) -> list[str]:
     """
     place = (folder or CONF) / group
     return sorted(p.relative_to(place).with_suffix("").as_posix() for p in place.rglob("*.yaml"))
+
+
+def about(file: Path) -> dict[str, str]:
+    """What the comment at the head of an option's YAML says.
+
+    Returns
+    -------
+    dict
+        `what` it is, the first sentence; and what it is `not_for`, the sentence after "Not for:".
+    """
+    lines = file.read_text(encoding="utf-8").splitlines()
+    head = itertools.takewhile(lambda line: line.startswith("#"), lines)
+    words = " ".join(line.lstrip("# ") for line in head if "@package" not in line)
+    text, _, limits = words.partition(" Not for: ")
+    return {"what": text.partition(". ")[0].removesuffix("."), "not_for": limits}
 
 
 def results() -> Path:
