@@ -10,7 +10,7 @@ import numpy as np
 
 from estimators.base import Belief
 from sim.arrays import Array
-from sim.errors import InputError
+from sim.errors import InputError, how_to_install
 from sim.recording import Frame
 from sim.sensors import Laser
 
@@ -31,7 +31,7 @@ def package(name: str, extra: str) -> Any:
         return importlib.import_module(name)
     except ImportError as error:
         raise MissingPackageError(
-            f"{name} cannot be imported ({error}); pip install 'estima[{extra}]'"
+            f"{name} cannot be imported ({error}); {how_to_install(extra)}"
         ) from error
 
 
