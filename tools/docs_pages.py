@@ -218,6 +218,7 @@ def _on_the_boards(name: str, rows: list[Judged], times: Mapping[str, float]) ->
                     where = f"{place} of {len(board)}"
                     cells.append((f"`{table}`", world, row.estimator, error, where, took))
     if cells:
+        yield "Places are among all methods of the study, whatever they read.\n"
         head = ("study", "world", "option", "position RMSE", "place", "processor time a Frame")
         yield from _table(head, cells)
     else:
@@ -290,4 +291,4 @@ def _prose(text: str) -> str:
             lines[-1] = f"**{lines[-1]}**\n"
         else:
             lines.append(line)
-    return "\n".join(lines).replace("|", "&#124;").replace("*ab*", "")
+    return "\n".join(lines)

@@ -44,7 +44,8 @@ def about(file: Path) -> dict[str, str]:
     head = itertools.takewhile(lambda line: line.startswith("#"), lines)
     words = " ".join(line.lstrip("# ") for line in head if "@package" not in line)
     text, _, limits = words.partition(" Not for: ")
-    return {"what": text.partition(". ")[0].removesuffix("."), "not_for": limits}
+    first = re.split(r"(?<!sec)\. +(?=[A-Z])", text, maxsplit=1)[0]  # not at "eqs. (1)"
+    return {"what": first.removesuffix("."), "not_for": limits}
 
 
 def results() -> Path:
