@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import hashlib
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, Protocol, TypeVar
@@ -12,12 +14,14 @@ from estimators.gaussian import Gaussian
 from sim.arrays import Array
 from sim.compiled import processor_s, wall_s
 from sim.errors import InputError, require, required
+from sim.formats.trajectory import FARTHEST_M, sound_covariances
 from sim.options import options
 from sim.recording import Frame, Recording
 from sim.robot.drive import RobotGeometry
 from sim.sensors import Laser, Sensors, StereoCamera, sensor_of
 
 S = TypeVar("S")
+P = TypeVar("P")
 
 
 @dataclass(frozen=True)
@@ -151,6 +155,10 @@ class Estimate:
 Answer = tuple[Estimate, Estimate | None]  # of one robot: online and revised
 
 
+class BeliefError(Exception):
+    """A step returned something else than a belief; the run's Status says what."""
+
+
 class Estimator(Protocol):
     """A localization method. It may also have `finish() -> Estimate`, the revised trajectory.
 
@@ -194,6 +202,24 @@ class TeamEstimator(Protocol):
         return self.step_team((frame,))[0]
 
 
+def detach(
+    prior: P, rng: np.random.Generator, *recordings: Recording
+) -> tuple[P, np.random.Generator]:
+    """Prior, or priors, and a generator that are an estimator's own, and lead to nothing else.
+
+    What it writes to them reaches no other estimator. The generator draws the same numbers. Its
+    seed sequence does not lead to the study's seed: it is a digest, by SHA-256, of its own and of
+    the recordings with their truth.
+    """
+    seeds: Any = rng.bit_generator.seed_seq
+    known = [getattr(seeds, "entropy", None), getattr(seeds, "spawn_key", None)]
+    text = repr([*known, *(recording.checksum for recording in recordings)])
+    hidden = int.from_bytes(hashlib.sha256(text.encode()).digest())
+    own = type(rng.bit_generator)(hidden)
+    own.state = rng.bit_generator.state
+    return copy.deepcopy(prior), np.random.Generator(own)
+
+
 def run(
     estimator: Estimator,
     recording: Recording,
@@ -222,8 +248,9 @@ def run(
         If the first step returns no Belief, or one of other shapes.
     """
     journal = Journal(estimator, recording, keep, on_step)
-    estimator.reset(prior, rng)
-    frames = ((frame,) for frame in recording.frames())
+    estimator.reset(*detach(prior, rng, recording))
+    seen = recording.with_wheel_radius(prior.robot.wheel_radius_m)
+    frames = ((frame,) for frame in seen.frames())
     walk(lambda instant: [estimator.step(*instant)], frames, {0: journal})
     return journal.estimate()
 
@@ -306,6 +333,7 @@ class Journal:
     ) -> None:
         n_frames = len(recording.frame_stamps)
         self._estimator, self._stamps, self._on_step = estimator, recording.frame_stamps, on_step
+        self._who = type(estimator).__name__
         self._means, self._covariances = np.empty((n_frames, 3)), np.empty((n_frames, 3, 3))
         self._seconds, self._n_noted = np.empty(n_frames), 0
         self._extras: dict[str, list[Any]] = {name: [] for name in keep}
@@ -316,13 +344,15 @@ class Journal:
 
         Raises
         ------
-        InputError
-            If the first is not a Belief, or has other shapes.
+        BeliefError
+            If it is not a Belief, or has other shapes; of the first, InputError.
         """
         i = self._n_noted
-        if i == 0:
-            _check_belief(belief, self._estimator)
-        self._means[i], self._covariances[i] = belief.mean, belief.covariance
+        try:
+            self._means[i], self._covariances[i] = read_belief(belief, self._who)
+        except BeliefError as error:
+            require(i > 0, str(error))
+            raise BeliefError(f"{error}, at {frame.stamp:.2f} s, step {i}") from error
         self._seconds[i] = seconds
         for name, values in self._extras.items():
             values.append(belief.extras.get(name))
@@ -345,14 +375,46 @@ class Journal:
         )
 
 
-def _check_belief(belief: Any, estimator: Any) -> None:
-    wanted = (
-        f"{type(estimator).__name__}.step must return a Belief with a mean of shape (3,) "
-        "and a covariance of shape (3, 3)"
-    )
-    require(isinstance(belief, Belief), f"{wanted}, got {type(belief).__name__}")
+def read_belief(belief: Any, who: str) -> tuple[Array, Array]:
+    """Mean (3,) and covariance (3, 3) of what `step` returned."""
+    wanted = "step must return a Belief with a mean of shape (3,) and a covariance of shape (3, 3)"
+    if not isinstance(belief, Belief):
+        raise BeliefError(f"{who}.{wanted}, got {type(belief).__name__}")
     try:
-        shapes = np.shape(belief.mean), np.shape(belief.covariance)
+        mean, covariance = np.asarray(belief.mean), np.asarray(belief.covariance)
     except ValueError as error:  # ragged lists
-        raise InputError(f"{wanted}: {error}") from error
-    require(shapes == ((3,), (3, 3)), f"{wanted}, got shapes {shapes[0]} and {shapes[1]}")
+        raise BeliefError(f"{who}.{wanted}: {error}") from error
+    if mean.shape != (3,) or covariance.shape != (3, 3):
+        raise BeliefError(f"{who}.{wanted}, got shapes {mean.shape} and {covariance.shape}")
+    if mean.dtype.kind not in "fiu" or covariance.dtype.kind not in "fiu":
+        raise BeliefError(f"{who}.{wanted}, of real numbers")
+    return mean, covariance
+
+
+def explain_unsound(estimate: Estimate) -> str:
+    """What the first belief of an estimate lacks, with its step and stamp; empty if they are sound.
+
+    Its mean is finite and within `FARTHEST_M`, its covariance as `sound_covariances` has it. What
+    an estimate with a status leaves open, with NaN, is passed over.
+    """
+    stamps, means, covariances = estimate.stamps, estimate.means, estimate.covariances
+    n = len(stamps)
+    shapes = np.shape(stamps), np.shape(means), np.shape(covariances)
+    if shapes != ((n,), (n, 3), (n, 3, 3)):
+        return "stamps, means and covariances of shapes {}, {} and {}".format(*shapes)
+    finite = np.isfinite(means) & np.isfinite(stamps)[:, None]
+    checks: dict[str, Any] = {
+        "stamp is not after the last": np.diff(stamps, prepend=-np.inf) > 0.0,
+        "mean is not finite": finite.all(axis=1),
+        f"mean is farther away than {FARTHEST_M:g} m": ~(np.abs(means) > FARTHEST_M).any(axis=1),
+        "covariance is not finite, symmetric and positive semidefinite": (
+            sound_covariances(covariances)
+        ),
+    }
+    given = np.isfinite(means).all(axis=1) & np.isfinite(covariances).all(axis=(1, 2))
+    for fault, sound in checks.items():
+        faulty = ~sound if estimate.status == "ok" else ~sound & given
+        if faulty.any():
+            step = int(np.argmax(faulty))
+            return f"the {fault} at {stamps[step]:.2f} s, step {step}"
+    return ""

@@ -14,6 +14,7 @@ from estimators.base import (
     Estimate,
     Journal,
     Prior,
+    detach,
     finish,
     run,
     run_and_finish,
@@ -96,10 +97,13 @@ def run_team(
             for number, of_robot in enumerate(zip(team.robots, priors, strict=True))
             for one in [make()]
         ]
+    believed = [prior.robot.wheel_radius_m for prior in priors]
+    own = [one.with_wheel_radius(m) for one, m in zip(team.robots, believed, strict=True)]
+    team = Team(tuple(own))
     begun, n = processor_s(), len(team)
     filters = [make() for _ in range(n if communication.kind == "range" else 1)]
     for number, each in enumerate(filters):
-        each.reset_team(priors, rng(number))
+        each.reset_team(*detach(priors, rng(number), *team.robots))
     of_robots = filters if len(filters) == n else n * filters
     journals = {
         number: Journal(each, recording, on_step=tell)

@@ -62,9 +62,9 @@ def blaming(where: str) -> Iterator[None]:
     """  # noqa: E501 the message is one line
     try:
         yield
-    except InputError:
+    except (InputError, KeyboardInterrupt):
         raise
-    except (Exception, SystemExit) as error:
+    except BaseException as error:
         last = traceback.extract_tb(error.__traceback__)[-1]
         reason = " ".join(str(error).split()) or "nothing said"
         place = f"{Path(last.filename).name}:{last.lineno}"

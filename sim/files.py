@@ -36,6 +36,28 @@ def read_head(path: Path) -> bytes:
         raise InputError(f"{path}: cannot read ({error.strerror})") from error
 
 
+def read_text(path: Path, most_bytes: int = 10_000_000) -> str:
+    """Text of a file that may come from anywhere.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read, is not a file, is longer than `most_bytes`, or is not UTF-8.
+    """
+    require_file(path)
+    try:
+        with path.open("rb") as file:
+            content = file.read(most_bytes + 1)
+        require(len(content) <= most_bytes, f"{path}: longer than {most_bytes} bytes; remove it")
+        return content.decode("utf-8-sig")
+    except OSError as error:
+        raise InputError(f"{path}: cannot read ({error.strerror}); check its name") from error
+    except UnicodeDecodeError as error:
+        raise InputError(
+            f"{path}: not UTF-8 text (byte {error.start}); save it as UTF-8"
+        ) from error
+
+
 @contextmanager
 def write_whole(path: Path, *, durable: bool = True) -> Iterator[Path]:
     """Give a path beside `path` to write to; move it into place if all went well.

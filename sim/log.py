@@ -13,6 +13,16 @@ from sim.errors import InputError, require, required
 from sim.sensors.base import Reading, Schema, Sensor, split_schema
 
 
+def detach(values: Values) -> Values:
+    """Copy of an array that nobody can write to: its memory belongs to a `bytes`.
+
+    It takes as long as `copy`, whose array may be made writable.
+    """
+    if isinstance(values, np.generic):
+        return values  # of a field without axes
+    return np.ndarray(values.shape, values.dtype, values.tobytes() or b"\0")
+
+
 @dataclass(frozen=True)
 class WheelLog:
     """Encoder readings: stamps (N,) s; position (N, 2), right and left, accumulated metres."""
@@ -87,10 +97,10 @@ class Log:
         return dataclasses.replace(self, stamps=stamps, values=values)
 
     def reading(self, row: int) -> Reading:
-        """One reading."""
+        """One reading, as arrays of its own, from which no way leads to the log."""
         rows = slice(*self.splits[row : row + 2]) if self.splits is not None else row
         return {
-            name: values[rows if self.schema[name].ragged else row]
+            name: detach(values[rows if self.schema[name].ragged else row])
             for name, values in self.values.items()
         }
 

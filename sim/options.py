@@ -37,7 +37,7 @@ from typing import (
 from pydantic import ConfigDict, Field, Strict, ValidationError
 from pydantic.dataclasses import dataclass as checked_dataclass
 
-from sim.errors import InputError, describe_unknown, require
+from sim.errors import InputError, blaming, describe_unknown, require
 
 T = TypeVar("T")
 
@@ -119,10 +119,17 @@ def options(where: str) -> Callable[[type[T]], type[T]]:
         del made.__signature__
         made.__init__ = checked
         made.__setattr__ = _set_state
-        made._place = where
+        made._options_place = where
         return cast("type[T]", made)
 
     return decorate
+
+
+@functools.cache
+def _option_names(cls: Any) -> frozenset[str]:
+    """Names of the fields of all classes of options that a class inherits."""
+    inherited: list[Any] = [base for base in cls.__mro__ if "_options_place" in vars(base)]
+    return frozenset(name for base in inherited for name in base.__dataclass_fields__)
 
 
 def _set_state(self: Any, name: str, value: Any) -> None:
@@ -130,7 +137,8 @@ def _set_state(self: Any, name: str, value: Any) -> None:
 
     The dataclass's own goes through every class that is inherited: 4 us a value, in every step.
     """
-    if name in type(self).__dataclass_fields__ or "_place" in vars(type(self)):
+    cls: Any = type(self)
+    if name in _option_names(cls) or "_options_place" in vars(cls):
         raise dataclasses.FrozenInstanceError(f"cannot assign to field {name!r}")
     object.__setattr__(self, name, value)
 
@@ -158,7 +166,7 @@ def build(cls: type[T], settings: Mapping[str, Any], where: str) -> T:
     )
     fields = {f.name: f for f in dataclasses.fields(cls)}  # type: ignore[arg-type]
     kinds = get_type_hints(cls)
-    own: str | None = getattr(cls, "_place", None)
+    own: str | None = getattr(cls, "_options_place", None)
     values: dict[str, Any] = {}
     for key, value in settings.items():
         place = f"{where}.{key}"
@@ -187,12 +195,13 @@ def find(target: Any, where: str) -> Callable[..., Any]:
         f"{where}._target_ must name a class or function, such as mine.Mine",
     )
     module_name, _, name = target.rpartition(".")
-    try:
-        module = importlib.import_module(module_name)
-    except ModuleNotFoundError as error:
-        raise InputError(
-            f"{where}._target_={target}: no module {error.name}; is its folder on PYTHONPATH?"
-        ) from error
+    with blaming(f"{where}._target_={target}"):  # what its module does when it is imported
+        try:
+            module = importlib.import_module(module_name)
+        except ModuleNotFoundError as error:
+            raise InputError(
+                f"{where}._target_={target}: no module {error.name}; is its folder on PYTHONPATH?"
+            ) from error
     found: Any = getattr(module, name, None)
     require(callable(found), f"{where}._target_={target}: {module_name} has no class {name}")
     return found  # type: ignore[no-any-return]

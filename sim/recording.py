@@ -14,6 +14,7 @@ import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -22,7 +23,7 @@ import numpy as np
 from sim.arrays import Array, Ints, Values
 from sim.errors import InputError, require, required
 from sim.files import write_whole
-from sim.log import CommandLog, Log, WheelLog, log_of_readings
+from sim.log import CommandLog, Log, WheelLog, detach, log_of_readings
 from sim.npz import UNREADABLE, read_arrays
 from sim.options import build
 from sim.recording_check import check_recording
@@ -91,7 +92,10 @@ class Truth:
 
 @dataclass(frozen=True, repr=False)
 class Frame:
-    """One instant at which a sensor fires, without the truth. Its arrays are read-only.
+    """One instant at which a sensor fires, without the truth.
+
+    Its arrays are read-only and hold nothing else: neither readings to come nor what the next
+    estimator sees.
 
     Attributes
     ----------
@@ -206,6 +210,15 @@ class Recording:
             self, sensors=_others(self.sensors, name), logs=_others(self.logs, name), truth=truth
         )
 
+    def with_wheel_radius(self, believed_m: float) -> Recording:
+        """Return the recording as read by wheels of this radius: travel in proportion to it."""
+        nominal_m = self.robot.wheel_radius_m
+        if believed_m == nominal_m:
+            return self
+        travel_m = self.wheels.position_m * (believed_m / nominal_m)
+        robot = dataclasses.replace(self.robot, wheel_radius_m=believed_m)
+        return dataclasses.replace(self, wheels=WheelLog(self.wheels.stamps, travel_m), robot=robot)
+
     def frames(self, robot: int = 0) -> Iterator[Frame]:
         """Walk through the Frames in order, as those of the robot of this number.
 
@@ -216,13 +229,12 @@ class Recording:
         position = self.wheels.at(stamps)
         increments = np.diff(position, axis=0, prepend=position[:1])
         durations = np.diff(stamps, prepend=stamps[:1])
-        increments.setflags(write=False)
         shown = {name: _rows_at(stamps, log).tolist() for name, log in self.logs.items()}
         for i, stamp in enumerate(stamps.tolist()):
             yield Frame(
                 stamp=stamp,
                 duration_s=float(durations[i]),
-                wheel_increments_m=increments[i],
+                wheel_increments_m=detach(increments[i]),
                 readings={
                     name: self.logs[name].reading(rows[i])
                     for name, rows in shown.items()
@@ -255,7 +267,7 @@ class Recording:
             found[wide & ~exact] = np.nan
         return found
 
-    @property
+    @cached_property
     def checksum(self) -> str:
         """SHA-256 over all the recording holds, as hex."""
         return digest_of(arrays_of(self), describe(self))

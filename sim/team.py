@@ -72,7 +72,7 @@ class Team:
     @property
     def checksum(self) -> str:
         """SHA-256 over all the team holds, as hex; of one robot, that of its recording."""
-        return digest_of(*_parts(self))
+        return self.robots[0].checksum if len(self) == 1 else digest_of(*_parts(self))
 
     @property
     def only(self) -> Recording:

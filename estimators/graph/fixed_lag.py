@@ -57,6 +57,7 @@ from estimators.laser.scan_matching import MatcherOptions, ScanMatcher
 from estimators.wheels import WheelOptions, WheelPrediction
 from sim import se2
 from sim.arrays import Array, Ints
+from sim.errors import require
 from sim.options import Count, NonNegative, options
 from sim.recording import Frame
 
@@ -88,6 +89,12 @@ class FixedLagOptions(WheelOptions, StereoOptions):
     for none."""
     sigma_range_m: NonNegative | None = None
     """Believed range noise of that laser, m; null: its own."""
+
+    def __post_init__(self) -> None:
+        require(
+            self.sigma_range_m is None or self.laser is not None,
+            "estimator.sigma_range_m has no effect without a laser; set estimator.laser",
+        )
 
 
 class FixedLag(FixedLagOptions):

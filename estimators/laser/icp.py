@@ -1,8 +1,8 @@
 """Registration of two laser scans in the plane: ICP from points to points, planes or lines.
 
-The lines are those of `estimators.laser.scan_lines`, cut from the whole scan; a plane is that of a
-point's neighbours. By default no share of the matches is trimmed, and gates narrow only after the
-increment has settled, so the few points that hold the robot along a corridor still count.
+The lines are those of `estimators.laser.scan_lines`, cut from the whole scan; a plane goes through
+a point, along its neighbours. By default no share of the matches is trimmed, and gates narrow only
+after the increment has settled, so the few points that hold the robot along a corridor still count.
 
 Poses `T_target_source` take points of the source scan into the frame of the target scan.
 """
@@ -17,8 +17,14 @@ from pydantic import Field
 
 from estimators.laser.icp_iterations import Fit, Pair, Sample, Settings, Stage, align
 from estimators.laser.icp_judgement import count_agreement, judge
-from estimators.laser.icp_start import as_segments, heading_by_lines, planes_of, representatives
-from estimators.laser.scan_lines import PreparedScan, Segments, prepare
+from estimators.laser.icp_start import (
+    Planes,
+    as_segments,
+    heading_by_lines,
+    planes_of,
+    representatives,
+)
+from estimators.laser.scan_lines import PreparedScan, prepare
 from sim.arrays import Array, Ints
 from sim.compiled import njit
 from sim.errors import InputError, require
@@ -27,6 +33,7 @@ from sim.options import Count, NonNegative, options
 __all__ = ["PreparedScan", "Registration", "Rules", "prepare", "register"]
 
 Metric = Literal["point_to_line", "point_to_plane", "point_to_point"]
+Plane = Literal["matched_point", "centroid"]
 Kernel = Literal["tukey", "huber", "none"]
 
 # Errors of the heading, rad, that the second and the third stage may find: they bound how far
@@ -61,6 +68,12 @@ class Rules:
     """Points of a plane, with its own (point to plane only); the paper gives no number. With 10
     and more, corners bend the planes, and registrations of successive scans (721 beams, 1 cm,
     tuning seeds) jump by decimetres now and then."""
+    plane: Plane = "matched_point"
+    """What a plane goes through: the `matched_point` (Chen and Medioni; PCL, Open3D and
+    libpointmatcher do the same), or the `centroid` of the neighbours, which in corners and at the
+    ends of walls lies off it. Noisy scans of one pose (ten places, 1 cm) then register up to 218,
+    360 or 570 urad and 0.8, 1.9 or 2.5 mm apart on average, with 6, 12 or 20 neighbours; by the
+    matched point 13, 9 or 8 urad and 0.04, 0.07 or 0.06 mm."""
 
 
 DEFAULT_RULES = Rules()
@@ -108,7 +121,7 @@ class Registration:
     normal_matrix: Array
     information: Array
     information_noise: Array
-    planes: Segments | None = None
+    planes: Planes | None = None
 
     @property
     def inliers(self) -> NDArray[np.bool_]:
@@ -165,8 +178,8 @@ def register(
     Point to line minimises sum w (n.(R p + t) - d)^2 over the lines of the target (Chen and
     Medioni); w is one over the variance that the range noise has along the normal, so beams
     that graze a wall, which feel its distance most finely, count most. Point to plane minimises
-    the same over the planes of the nearest points, each that of its nearest neighbours,
-    with one variance for all (decristoforis2020, sec. II-C). Point to point minimises
+    the same over the planes through the nearest points, each with the normal of its nearest
+    neighbours and one variance for all (decristoforis2020, sec. II-C). Point to point minimises
     sum w |R p + t - q|^2 over the nearest points (Besl and McKay). The last two have the same
     points, stages and end of iterations.
 
@@ -225,10 +238,12 @@ def register(
             Stage(False, huber, min(gate_m, 0.2), width, math.inf, 10.0),
         )
     surface = target.segments if whole_lines else as_segments(target)
-    planes = surface
+    planes, of_points = surface, None
     if metric == "point_to_plane":
-        normals, offsets = planes_of(target.points, rules.neighbours)
-        planes = surface._replace(normals=normals, distances_m=offsets)
+        of_points = planes_of(
+            target.points, rules.neighbours, through_centroid=rules.plane == "centroid"
+        )
+        planes = surface._replace(normals=of_points.normals, distances_m=of_points.distances_m)
     pair = Pair(
         source, target, whole_lines, metric != "point_to_point", surface, planes,
         max(source.noise_m, target.noise_m),
@@ -248,7 +263,7 @@ def register(
         status = "not_converged"
     return Registration(
         pose, metric, status, fit.matches, fit.residuals, fit.weights, iterations, converged,
-        normal, information, spurious, planes if metric == "point_to_plane" else None,
+        normal, information, spurious, of_points,
     )  # fmt: skip
 
 

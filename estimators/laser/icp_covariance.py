@@ -131,11 +131,12 @@ def _censi(
 def _censi_planes(
     found: Registration, source: PreparedScan, target: PreparedScan
 ) -> tuple[Array, Array, Array]:
-    """The same three of point to plane; normals are held, and a plane moves as its point does."""
+    """The same three of point to plane; normals are held, a plane moves as its members' mean."""
     assert found.planes is not None
     rows = np.flatnonzero(found.weights > 0.0)
     w, e, j = found.weights[rows], found.residuals_m[rows], found.matches[rows]
-    n1, n2 = found.planes.normals[j].T
+    normals, members = found.planes.normals[j], found.planes.members[j]
+    n1, n2 = normals.T
     turn = np.array([0.0, 0.0, found.T_target_source[2]])
     qx, qy = se2.transform(turn, source.points[rows]).T
     vx, vy = se2.transform(turn, source.rays[rows]).T
@@ -144,8 +145,9 @@ def _censi_planes(
     A[2, 2] -= np.sum(w * e * (n1 * qx + n2 * qy))
     by_range = w * (n1 * vx + n2 * vy) * J
     by_range[2] += w * e * (n2 * vx - n1 * vy)
-    facing = n1 * target.rays[j, 0] + n2 * target.rays[j, 1]
-    shared: Array = np.stack([np.bincount(j, w * facing * row) for row in J])
+    facing = np.einsum("kmi,ki->km", target.rays[members], normals) / members.shape[1]
+    of_members = [(row[:, None] * facing).ravel() for row in w * J]
+    shared: Array = np.stack([np.bincount(members.ravel(), part) for part in of_members])
     return A, by_range @ by_range.T, shared @ shared.T
 
 

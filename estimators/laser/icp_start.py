@@ -1,12 +1,13 @@
 """What a registration starts from: a heading, a few points of the source, the target's surface."""
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from estimators.laser.icp_iterations import Sample
 from estimators.laser.scan_lines import PreparedScan, Segments
-from sim.arrays import Array
+from sim.arrays import Array, Ints
 from sim.compiled import njit
 
 _COARSE_POINTS = 6  # points that stand for a line of the source until the poses are close
@@ -19,15 +20,40 @@ def as_segments(scan: PreparedScan) -> Segments:
     return Segments(np.tile([1.0, 0.0], (n, 1)), x, spans, end_rays, np.zeros(n))
 
 
+class Planes(NamedTuple):
+    """Planes of the points of a scan (K,).
+
+    Attributes
+    ----------
+    normals, distances_m
+        (K, 2) and (K,): of the plane from the sensor, along its normal.
+    members
+        (K, M) the points through whose mean each plane goes.
+    """
+
+    normals: Array
+    distances_m: Array
+    members: Ints
+
+
+def planes_of(points: Array, n_near: int, *, through_centroid: bool) -> Planes:
+    """Planes with the normals of each point's nearest neighbours, through it or their centroid."""
+    normals, members = _normals_of(points, n_near)
+    if not through_centroid:
+        members = np.arange(len(points))[:, None]
+    distances_m = np.sum(normals * points[members].mean(axis=1), axis=1)
+    return Planes(normals, distances_m, members)
+
+
 @njit(error_model="numpy")
-def planes_of(points: Array, n_near: int) -> tuple[Array, Array]:
-    """Normals and offsets of the planes, by least squares, of each point's nearest neighbours.
+def _normals_of(points: Array, n_near: int) -> tuple[Array, Ints]:
+    """Normals, by least squares, of each point's nearest neighbours, and these.
 
     They are looked for among as many beams to either side as there are neighbours.
     """
     n = len(points)
-    normals, offsets = np.empty((n, 2)), np.empty(n)
-    near, apart = np.empty(n_near, np.int64), np.empty(n_near)
+    n_near = min(n_near, n)
+    normals, near, apart = np.empty((n, 2)), np.empty((n, n_near), np.int64), np.empty(n_near)
     for i in range(n):
         found = 0
         for j in range(max(i - n_near, 0), min(i + n_near + 1, n)):
@@ -38,22 +64,21 @@ def planes_of(points: Array, n_near: int) -> tuple[Array, Array]:
                 continue
             place = found - 1
             while place > 0 and apart[place - 1] > d2:
-                near[place], apart[place] = near[place - 1], apart[place - 1]
+                near[i, place], apart[place] = near[i, place - 1], apart[place - 1]
                 place -= 1
-            near[place], apart[place] = j, d2
+            near[i, place], apart[place] = j, d2
         x = y = xx = xy = yy = 0.0
-        for k in range(found):
-            x += points[near[k], 0] / found
-            y += points[near[k], 1] / found
-        for k in range(found):
-            dx, dy = points[near[k], 0] - x, points[near[k], 1] - y
+        for k in near[i]:
+            x += points[k, 0] / n_near
+            y += points[k, 1] / n_near
+        for k in near[i]:
+            dx, dy = points[k, 0] - x, points[k, 1] - y
             xx += dx * dx
             xy += dx * dy
             yy += dy * dy
         along = 0.5 * math.atan2(2.0 * xy, xx - yy)
         normals[i, 0], normals[i, 1] = -math.sin(along), math.cos(along)
-        offsets[i] = normals[i, 0] * x + normals[i, 1] * y
-    return normals, offsets
+    return normals, near
 
 
 @njit(error_model="numpy", fastmath={"contract"})

@@ -235,10 +235,10 @@ class ScanMatcher:
         if self.believed.covariance == "hessian":
             return icp_covariance.hessian(found)
         if self.believed.covariance == "sampling":
-            return icp_covariance.sampling(found, source, target, rng, sigma_m)
+            return icp_covariance.sampling(found, source, target, rng, sigma_m, rules=self.rules)
         if self.believed.covariance == "unscented_censi":
             return icp_covariance.unscented_censi(
-                found, source, target, of_guess, sigma_m, matches="sliding"
+                found, source, target, of_guess, sigma_m, matches="sliding", rules=self.rules
             )
         scans: icp_covariance.Scans = "last" if self.believed.covariance == "censi_last" else "both"
         return icp_covariance.censi(found, source, target, sigma_m, scans=scans, matches="sliding")

@@ -16,6 +16,7 @@ from estimators.programs.program import (
     ProgramError,
     ProgramOptions,
     Seconds,
+    draw_seed,
     explain_mismatch,
     map_message,
 )
@@ -49,19 +50,22 @@ class External(ExternalOptions):
 
     def reset(self, prior: Prior, rng: np.random.Generator) -> None:
         """Start the program, and tell it what is known."""
-        message = {
-            "type": "reset",
+        message = {"type": "reset", **self._introduce(prior, rng)}
+        if self._program is not None:
+            self._program.close()
+        self._program, self._stamps = Program(self.words), list[float]()
+        self._ask(message, self.start_s, "reset")
+
+    def _introduce(self, prior: Prior, rng: np.random.Generator) -> dict[str, Any]:
+        """What is known at the start."""
+        return {
             "protocol": PROTOCOL,
-            "seed": int(rng.integers(2**32)),
+            "seed": draw_seed(rng),
             "robot": dataclasses.asdict(prior.robot),
             "sensors": {name: sensor_settings(one) for name, one in prior.sensors.items()},
             "prior": prior.start and vars(prior.start),
             "map": map_message(prior.map),
         }
-        if self._program is not None:
-            self._program.close()
-        self._program, self._stamps = Program(self.words), list[float]()
-        self._ask(message, self.start_s, "reset")
 
     def step(self, frame: Frame) -> Belief:
         """Send the Frame, and take the belief that comes back."""
@@ -101,14 +105,13 @@ class External(ExternalOptions):
         self, message: Any, limit_s: float, what: str, most_bytes: int = _STEP_BYTES
     ) -> dict[str, Any]:
         assert self._program is not None
-        line = orjson.dumps(message, option=orjson.OPT_SERIALIZE_NUMPY | orjson.OPT_APPEND_NEWLINE)
         try:
-            text = self._program.ask(line, limit_s, most_bytes)
+            text = self._program.ask(self._encode(message), limit_s, most_bytes)
         except ProgramError as error:
             raise ProgramError(f"{error} (asked: {what})") from error
         try:
-            answer = orjson.loads(text)
-        except orjson.JSONDecodeError:
+            answer = self._decode(text)
+        except ValueError:
             answer = None
         if not isinstance(answer, dict):
             shown = text[:60].decode(errors="replace")
@@ -116,6 +119,14 @@ class External(ExternalOptions):
         if answer.get("error") is not None:
             raise self._wrong(f"answered {what} with the error {str(answer['error'])[:300]}")
         return answer
+
+    @staticmethod
+    def _encode(message: Any) -> bytes:
+        return orjson.dumps(message, option=orjson.OPT_SERIALIZE_NUMPY | orjson.OPT_APPEND_NEWLINE)
+
+    @staticmethod
+    def _decode(line: bytes) -> Any:
+        return orjson.loads(line)
 
     def _numbers(self, answer: dict[str, Any], key: str, shape: tuple[int, ...]) -> Array:
         """Numbers of an answer, of a shape."""

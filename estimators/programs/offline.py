@@ -19,6 +19,7 @@ from estimators.programs.program import (
     ProgramError,
     ProgramOptions,
     Seconds,
+    draw_seed,
     explain_mismatch,
     map_message,
 )
@@ -105,7 +106,7 @@ class Offline(OfflineOptions):
             "map" not in self.needs or isinstance(prior.map, (World, OccupancyGrid)),
             "estimator.command names {map} or {grid}; set prior.map=world or GRID.yaml",
         )
-        self._prior, self._seed = prior, int(rng.integers(2**32))
+        self._prior, self._seed = prior, draw_seed(rng)
         self._frames = list[Frame]()
         self._pose = np.zeros(3) if prior.mean is None else prior.mean.copy()
 

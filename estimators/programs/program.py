@@ -164,6 +164,10 @@ class Program:
         if code != 0:
             raise self._error("failed")
 
+    def spent_s(self) -> float:
+        """Processor time that it has taken so far, s; without that of processes it started."""
+        return time.clock_gettime((~self._process.pid << 3) | 2)  # CPUCLOCK_SCHED of a process
+
     def close(self, patience_s: float = _PATIENCE_S) -> float:
         """Let it end, with its whole process group; return the processor time that it took, s.
 
@@ -242,6 +246,14 @@ def _end(process: subprocess.Popen[bytes], patience_s: float) -> float:
 
 def _quoted(text: bytes | bytearray) -> str:
     return repr(re.sub(r"\s+", " ", bytes(text[:60]).decode(errors="replace")))
+
+
+def draw_seed(rng: np.random.Generator) -> int:
+    """Seed for a program, from which that of the study cannot be got by trying.
+
+    It comes from the generator's seed sequence, which `estimators.base.detach` hides.
+    """
+    return int(rng.bit_generator.seed_seq.generate_state(1)[0])
 
 
 def map_message(known_map: Any) -> dict[str, Any] | None:

@@ -9,6 +9,9 @@ covariance that the true pair allows (`evaluation.scan_bound`), 2.366 the median
 3 degrees of freedom: an efficient estimator has 1. The bound noted beside `error_mm` is the root of
 the trace of F's position block. A failure is an error of more than 5 cm or 1 degree; failures count
 in all medians. The fusion of wheels and laser is timed at the laser's full rate.
+
+Scans of one pose that differ in their noise alone should register as the identity on average; what
+they are off by is the bias of the metric.
 """
 
 import importlib.util
@@ -28,6 +31,7 @@ from estimators.laser.icp import Metric, PreparedScan, Registration, prepare, re
 from estimators.peers import pose_of
 from experiments.bench.measure import Measurement, median_time_s
 from experiments.evaluation.metrics import score
+from experiments.evaluation.registration_errors import same_pose_errors
 from experiments.evaluation.scan_bound import cast, fisher_bound
 from experiments.runs.evaluate import run_over
 from experiments.runs.experiment import Experiment
@@ -35,6 +39,8 @@ from experiments.runs.seeds import stream
 from sim import se2
 from sim.arrays import Array
 from sim.recording import Recording
+from sim.sensors import Laser
+from sim.sensors.casting import SegmentCaster
 from sim.worlds.world import World
 
 Matcher = Callable[[Array, Array], Array]  # ranges of the target and of the source -> pose
@@ -56,6 +62,7 @@ _OFFICE = (
 _GOALS = {"ekf_icp": 20.0, "ekf_icp_paper": None, "icp_odometry": None}
 _SPARING = ("estimator.register_distance_m=0.05", "estimator.register_turn_rad=0.05")
 _OFFICES = range(1000, 1004)  # seeds
+_N_SAME_POSE = 1000  # noisy pairs a place
 
 
 @dataclass(frozen=True)
@@ -69,7 +76,7 @@ class Pair:
 
 
 def run() -> Iterator[Measurement]:
-    """Both metrics over all classes, covariances, installed peers, and the fusion with wheels."""
+    """All metrics over all classes, covariances, peers, bias at one pose, and the fusion."""
     classes = {
         f"{place}_{size}": [pair(place, size, seed) for seed in _SEEDS]
         for place in ("room", "corridor")
@@ -85,6 +92,7 @@ def run() -> Iterator[Measurement]:
         for kind, pairs in classes.items():
             chosen = pairs[:60] if name.startswith("peer") else pairs
             yield from _measure(f"icp.{name}.{kind}", match, chosen)
+    yield from _same_pose()
     yield from _fusion()
 
 
@@ -112,6 +120,35 @@ def pair(place: str, size: str, seed: int) -> Pair:
     )
     bound = fisher_bound(walls, T_w_target, T_w_source, BEARINGS_RAD, SIGMA_RANGE_M)
     return Pair(target_m, source_m, motion, bound)
+
+
+def places(n: int = 10) -> Iterator[tuple[Laser, Array]]:
+    """Laser and its scan (n_beams,) m without noise: a small one in rooms, an LMS291 in offices.
+
+    Places are on the worlds' tours, with any heading; the seeds are for tuning.
+    """
+    for seed in range(n):
+        world, sensors = ("office", "lms291") if seed % 2 else ("rooms", "hokuyo")
+        experiment = Experiment.compose([f"world={world}", f"sensors={sensors}", f"seed={seed}"])
+        laser, rng = experiment.sensors()["laser"], stream(seed, "bench")
+        assert isinstance(laser, Laser)
+        tour = experiment.world().waypoints
+        k = rng.integers(len(tour) - 1)
+        at = np.append(tour[k] + rng.random() * (tour[k + 1] - tour[k]), rng.uniform(-np.pi, np.pi))
+        yield laser, SegmentCaster(experiment.world(), laser).cast(at)
+
+
+def _same_pose() -> Iterator[Measurement]:
+    """Largest mean error of point to plane between noisy scans of one pose, over ten places."""
+    means = [
+        same_pose_errors(scan_m, laser, stream(k, "sensors"), _N_SAME_POSE).mean(axis=(0, 1))
+        for k, (laser, scan_m) in enumerate(places())
+    ]
+    off = np.max(np.abs(means), axis=0)
+    note = f"largest mean over {len(means)} places, {_N_SAME_POSE} noisy pairs each, both ways"
+    row = "icp.point_to_plane.same_pose_bias"
+    yield Measurement(f"{row}_urad", 1e6 * float(off[2]), "µrad", 15.0, note=note)
+    yield Measurement(f"{row}_mm", 1e3 * float(off[:2].max()), "mm", 0.05, note=note)
 
 
 def _match(metric: Metric, target_m: Array, source_m: Array) -> Array:

@@ -55,10 +55,10 @@ def _clock(name: str, stamps: Array) -> list[str]:
             f"{name}: {n} gap{'s' * (n > 1)}, the longest {gaps[longest]:.3g} s at "
             f"{stamps[longest] - stamps[0]:.1f} s (usually {usual:.3g} s apart)"
         )
+    rounding_s = 1e-9 + 4.0 * np.spacing(np.abs(stamps).max())  # 1 us of Unix time
     for step in reversed(_DECIMALS):
-        # how far the stamps are from whole steps, beyond what a double rounds
-        off = np.abs(stamps / step - np.round(stamps / step)).max()
-        if off < 1e-9 * max(1.0, float(np.abs(stamps).max()) / step):
+        off_s = np.abs(stamps - step * np.round(stamps / step)).max()
+        if off_s < rounding_s:
             if step > 0.1 * usual:
                 warnings.append(
                     f"{name}: stamps are whole steps of {step:g} s, which is coarse for readings "

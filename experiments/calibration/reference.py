@@ -108,7 +108,7 @@ def wheel_delay_s(wheels: WheelLog, reference: Reference) -> Interval:
     """
     rows = spaced_rows(reference.stamps, 0.1)
     stamps, heading = reference.stamps[rows], np.unwrap(reference.poses[rows, 2])
-    joined = np.array([reference.joined[a:b].all() for a, b in pairwise(rows)])
+    joined = np.array([reference.joined[a:b].all() for a, b in pairwise(rows)], bool)
     joined &= np.diff(stamps) < 2.0
     turns = np.diff(heading)
     delays = np.arange(-LARGEST_DELAY_S, LARGEST_DELAY_S + 1e-9, _DELAY_STEP_S)

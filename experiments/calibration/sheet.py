@@ -5,6 +5,7 @@ Columns: `case` (any name), `v_mps`, `omega_radps` and `duration_s` of the comma
 """
 
 import csv
+import io
 import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -15,6 +16,7 @@ from experiments.calibration.end_poses import Manoeuvre, from_end_poses
 from experiments.calibration.result import CalibrationResult
 from sim.arrays import Array
 from sim.errors import InputError, require
+from sim.files import read_text
 from sim.formats.text import LARGEST
 from sim.robot.drive import DifferentialDrive
 from sim.routes.route import OpenLoop
@@ -124,7 +126,7 @@ def unwrap_headings(headings: Sequence[Array], turns: Sequence[float]) -> list[A
 def _rows(path: Path) -> Iterator[tuple[int, dict[str, str | None]]]:
     """Number and cells of each line."""
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
+        with io.StringIO(read_text(path), newline="") as file:
             reader = csv.DictReader(file, restkey="more", skipinitialspace=True)
             given = [name.strip() for name in reader.fieldnames or ()]
             wanted, got = ",".join(COLUMNS), ",".join(given) or "none"
@@ -138,7 +140,7 @@ def _rows(path: Path) -> Iterator[tuple[int, dict[str, str | None]]]:
                     "more" not in row, f"{path}:{reader.line_num}: more than {len(COLUMNS)} cells"
                 )
                 yield reader.line_num, row
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+    except csv.Error as error:
         raise InputError(f"{path}: cannot read ({error})") from error
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from omegaconf import OmegaConf
 
-from experiments.runs.compose import name_study_files, open_composer, searched
+from experiments.runs.compose import open_composer, searched
 from experiments.runs.console import show
 from experiments.runs.experiment import Experiment
 from experiments.runs.run import Draw, run_once
@@ -65,8 +65,8 @@ class CommandLine:
 def run_arguments(arguments: Sequence[str], draw: Draw, out: Path | None = None) -> None:
     """Run one configuration by a command line's arguments, or print it."""
     line = CommandLine.of(arguments)
-    with open_composer(searched(line.config_dir)) as composer:
-        found = composer.compose(name_study_files(line.overrides))
+    with open_composer([*searched(line.config_dir), *line.overrides]) as composer:
+        found = composer.compose(composer.words)
     if line.shown:
         show(OmegaConf.to_yaml(found.cfg, resolve=line.resolved))
         return

@@ -12,6 +12,7 @@ from experiments.cli.flags import ConfigDir, Overrides
 from experiments.runs import columns, paths
 from experiments.runs.console import show
 from sim.errors import require
+from sim.files import read_text
 
 
 def options(
@@ -80,7 +81,7 @@ def _describe(group: str, name: str, config_dir: Path | None) -> None:
     known = f"no {group} named {name}; there are: {', '.join(names)}"
     require(name in names or group in _groups_of(name, config_dir), known)
     if group == "study":
-        show(_file_of(group, name, config_dir).read_text(encoding="utf-8").rstrip())
+        show(read_text(_file_of(group, name, config_dir)).rstrip())
     else:
         show(describe_option(group, name, searched(config_dir)))
 

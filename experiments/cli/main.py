@@ -13,6 +13,7 @@ import typer
 from experiments.cli import logs, look, project, run, score, tables
 from experiments.cli.flags import PASS_ON
 from experiments.runs.console import exit_with
+from experiments.runs.paths import TRUST
 from experiments.runs.version import code_version
 from sim.errors import InputError
 
@@ -46,6 +47,14 @@ def options_of_all(
             help="Folder of results; `results` unless set. Before or after the command's name.",
         ),
     ] = None,
+    trust: Annotated[
+        bool,
+        typer.Option(
+            "--trust",
+            help="Run what results, studies and suites from elsewhere name (docs/security.md). "
+            "Before or after the command's name.",
+        ),
+    ] = False,
     _: Annotated[
         bool,
         typer.Option(
@@ -56,6 +65,8 @@ def options_of_all(
     """Options of all commands."""
     if results is not None:
         os.environ["ESTIMA_RESULTS"] = str(results.absolute())
+    if trust:
+        os.environ[TRUST] = "1"
 
 
 _COMMANDS: dict[str, Callable[..., None]] = {  # as `estima --help` lists them
@@ -88,8 +99,17 @@ for _name, _command in _COMMANDS.items():
 
 def main() -> None:
     """Run the command line; wrong input ends in one line and code 2, a failed run in code 1."""
+    _open_closed_streams()
     try:
-        app(_results_first(sys.argv[1:]))
+        try:
+            Path.cwd()
+        except OSError:
+            gone = "the current folder is gone, or may not be entered; cd to another"
+            raise InputError(gone) from None
+        try:
+            app(_own_first(sys.argv[1:]))
+        finally:
+            sys.stdout.flush()
     except (Exception, KeyboardInterrupt) as error:
         exit_with(error)
     except SystemExit as ended:
@@ -98,8 +118,19 @@ def main() -> None:
         raise
 
 
-def _results_first(arguments: list[str]) -> list[str]:
-    """Move `--results DIR`, which may be anywhere, before the command's name."""
+def _open_closed_streams() -> None:
+    """Give whoever closed a standard stream the null device, lest a file takes its number."""
+    while (number := os.open(os.devnull, os.O_RDWR)) <= 2:
+        pass
+    os.close(number)
+    sys.stdout = sys.stdout or os.fdopen(1, "w")
+    sys.stderr = sys.stderr or os.fdopen(2, "w")
+
+
+def _own_first(arguments: list[str]) -> list[str]:
+    """Move `--results DIR` and `--trust`, which may be anywhere, before the command's name."""
+    if "--trust" in arguments:
+        return ["--trust", *_own_first([a for a in arguments if a != "--trust"])]
     for i, argument in enumerate(arguments):
         if argument.partition("=")[0] == "--results":
             n_words = 1 if "=" in argument else 2

@@ -22,6 +22,10 @@ def run(
             "--out", "-o", help="File of the estimate to write too: .tum, .csv, .json, .mcap, .bag."
         ),
     ] = None,
+    against: Annotated[
+        list[str] | None,
+        typer.Option(help="With until=decided: compare each with this estimator; repeat it."),
+    ] = None,
 ) -> None:
     """Make or read a recording, run an estimator over it, and write its row of results.
 
@@ -40,12 +44,17 @@ def run(
 
       estima run -m robot.kr=1e-5,1e-4 seed="range(0,5)"
 
+      estima run -m estimator=odometry,ekf_icp sensors=hokuyo seed="range(1000,1100)" until=decided
+
       estima run --config-dir mine estimator=mine (your own estimator)
 
       estima run --cfg job (print the configuration; estima options lists the groups)
     """
     arguments = [*(overrides or []), *context.args]
     many = {"-m", "--multirun"} & set(arguments)
+    if against:
+        require(many, f"--against {against[0]}: goes with -m and until=decided")
+        arguments.append(f"against={','.join(against)}")
     if out is not None:
         from experiments.trajectories.convert import check_estimate_name
 

@@ -10,7 +10,15 @@ import pandas as pd
 from scipy.spatial import KDTree
 
 from estimators.laser import icp_covariance
-from estimators.laser.icp import Metric, PreparedScan, Registration, prepare, register
+from estimators.laser.icp import (
+    DEFAULT_RULES,
+    Metric,
+    PreparedScan,
+    Registration,
+    Rules,
+    prepare,
+    register,
+)
 from experiments.evaluation.scan_bound import cast, fisher_bound
 from sim import se2
 from sim.arrays import Array, Ints
@@ -110,6 +118,38 @@ def measure(
             }
         )
     return pd.DataFrame(rows)
+
+
+def same_pose_errors(
+    ranges_m: Array,
+    laser: Laser,
+    rng: np.random.Generator,
+    n_pairs: int,
+    metric: Metric = "point_to_plane",
+    rules: Rules = DEFAULT_RULES,
+) -> Array:
+    """Errors (n_pairs, 2, 3) m, m, rad, of registering noisy scans of one pose, from the identity.
+
+    Each pair is registered both ways. The two scans are alike, so either way has the same bias,
+    while most of the noise changes its sign and cancels in their mean.
+
+    Parameters
+    ----------
+    ranges_m
+        (n_beams,) without noise.
+    """
+    errors = np.empty((n_pairs, 2, 3))
+    for k in range(n_pairs):
+        one, other = (
+            prepare(laser.measure(ranges_m, rng), laser.bearings_rad, laser.max_range_m)
+            for _ in range(2)
+        )
+        for way, (source, target) in enumerate(((one, other), (other, one))):
+            found = register(
+                source, target, np.zeros(3), metric=metric, gate_m=0.6, gate_rad=0.06, rules=rules
+            )
+            errors[k, way] = found.T_target_source
+    return errors
 
 
 Method = Callable[[Registration, PreparedScan, PreparedScan], Array]

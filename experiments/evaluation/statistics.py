@@ -73,13 +73,13 @@ def bootstrap_interval(
 
 def log_ratio_interval(first: ArrayLike, second: ArrayLike, level: float = 0.95) -> Interval:
     """Geometric mean of the paired ratios first / second, with the t interval of its log."""
-    found = mean_interval(_log_ratios(first, second), level)
+    found = mean_interval(log_ratios(first, second), level)
     return Interval(*(math.exp(v) for v in (found.value, found.low, found.high)))
 
 
 def wilcoxon_p(first: ArrayLike, second: ArrayLike) -> float:
     """P of the one-sided signed-rank test that first is below second in paired logs."""
-    return float(stats.wilcoxon(_log_ratios(first, second), alternative="less").pvalue)
+    return float(stats.wilcoxon(log_ratios(first, second), alternative="less").pvalue)
 
 
 def paired_p(differences: ArrayLike) -> float:
@@ -113,7 +113,7 @@ def log_log_slope(x: ArrayLike, y: ArrayLike) -> float:
     return float(np.polyfit(np.log(x), np.log(y), 1)[0])
 
 
-def _log_ratios(first: ArrayLike, second: ArrayLike) -> Array:
+def log_ratios(first: ArrayLike, second: ArrayLike) -> Array:
     """Logs (N,) of paired ratios.
 
     Raises

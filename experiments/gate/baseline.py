@@ -1,6 +1,7 @@
 """Baselines of a suite: read, checked against, renewed and written."""
 
 import contextlib
+import os
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -137,7 +138,7 @@ def renew_baseline(
 
 def is_main(suite: str) -> bool:
     """Whether this is the main suite, conf/suite/check.yaml."""
-    return suite_path(suite).resolve() == suite_path("check").resolve()
+    return os.path.realpath(suite_path(suite)) == os.path.realpath(suite_path("check"))
 
 
 def baseline_paths(suite: str, *, own: bool = False) -> dict[str, Path]:

@@ -34,7 +34,7 @@ def write_recordings(
     Teams are left out.
     """
     named = {entry.recordings for entry in suite.estimators}
-    groups = [g for g in named if Experiment.compose(suite.overrides[g]).team is None]
+    groups = [g for g in named if suite.compose(suite.overrides[g]).team is None]
     total = sum(suite.counts[group] for group in groups)
     bags = importlib.util.find_spec("rosbags") is not None
     runs = ((group, *run) for group in groups for run in _recordings(suite, group))
@@ -134,7 +134,7 @@ def _errors(
 
 def _recordings(suite: Suite, group: str) -> Iterator[tuple[int, Experiment, Team]]:
     """Seed, experiment and recording, one after another."""
-    whole = Experiment.compose(suite.overrides[group])
+    whole = suite.compose(suite.overrides[group])
     for i in range(suite.counts[group]):
         seed = suite.first_seed + i
         experiment = whole.with_values(seed=seed, world_seed=seed)

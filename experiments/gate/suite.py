@@ -114,12 +114,21 @@ class Suite:
         Of each group: how many recordings, and the Hydra overrides that make them.
     estimators
         In the order of the file.
+    source
+        The file; None of the package's own.
     """
 
     first_seed: int
     counts: Mapping[str, int]
     overrides: Mapping[str, tuple[str, ...]]
     estimators: tuple[Entry, ...]
+    source: Path | None = None
+
+    def compose(self, overrides: Sequence[str]) -> Experiment:
+        """Compose the experiment of overrides that it holds."""
+        if self.source is None:
+            return Experiment.compose(overrides)
+        return Experiment.compose(data=overrides, source=self.source)
 
     def cut(self, share: float) -> Suite:
         """Return the same suite with this share of its recordings."""
@@ -163,9 +172,11 @@ def read_suite(path: Path) -> Suite:
     """
     content = read_yaml(path)
     try:
-        return _suite(build(_File, content, "suite"))
+        suite = _suite(build(_File, content, "suite"))
     except InputError as error:
         raise InputError(f"{path}: {error}; conf/suite/check.yaml is an example") from error
+    own = path.resolve().is_relative_to(paths.CONF.resolve())
+    return dataclasses.replace(suite, source=None if own else path)
 
 
 def _suite(file: _File) -> Suite:
@@ -230,9 +241,7 @@ def run_suite(
         runs = [
             (
                 entry,
-                Experiment.compose(_overrides(suite, entry)).with_values(
-                    repeats=repeats[entry.name]
-                ),
+                suite.compose(_overrides(suite, entry)).with_values(repeats=repeats[entry.name]),
                 (planted or {}).get(entry.name),
             )
             for entry in suite.estimators
@@ -259,7 +268,7 @@ def draw_run(suite: Suite, estimator: str, recording: int, path: Path) -> bool:
         estimates.append((read, revised if entry.revised and revised is not None else online))
 
     (row, *_) = evaluate(
-        Experiment.compose(_overrides(suite, entry, recording)).with_values(repeats=1),
+        suite.compose(_overrides(suite, entry, recording)).with_values(repeats=1),
         streams=partial(_stream, f"estimator/{estimator}", recording, 0),
         on_estimate=keep,
     )

@@ -15,6 +15,9 @@ from scipy import stats
 
 from experiments.evaluation.statistics import Interval, log_ratio_interval, wilcoxon_p
 
+EQUIVALENCE = "equivalence"  # as an effect in words
+SMALLEST_EFFECT = 0.1  # of interest, where nothing speaks for another: a ratio of 1.1
+
 
 class Verdict(StrEnum):
     """Whether an interval meets a criterion."""
@@ -90,8 +93,9 @@ class Claim:
         The verdict; what came out besides the interval, in words.
     role
         Whether the claim's verdict follows from it.
-    more
-        How many more recordings would settle it if it is undecided; 0: unknown.
+    effect, power
+        Smallest effect of interest, in words, and the power with which data of this size decide it;
+        NaN: unknown.
     facts
         What came out besides the interval, by name, such as `p` of a test.
     """
@@ -103,7 +107,8 @@ class Claim:
     verdict: Verdict
     reason: str = ""
     role: Role = Role.HEADLINE
-    more: int = 0
+    effect: str = ""
+    power: float = math.nan
     facts: Mapping[str, Any] = field(default_factory=dict)
 
     @property
@@ -147,26 +152,49 @@ def judge_interval(
     return Verdict.NOT_REPRODUCED if outside else Verdict.UNDECIDED
 
 
-def more_to_settle(
-    found: Interval, n: int, at_least: float = -math.inf, at_most: float = math.inf
-) -> int:
-    """How many more recordings would settle an interval from n of them; 0: none, or unknown.
+def power_of(
+    found: Interval,
+    effect: float = SMALLEST_EFFECT,
+    band: tuple[float, float] = (-math.inf, math.inf),
+    *,
+    level: float = 0.95,
+    error: float | None = None,
+) -> float:
+    """Power that data of this size have, by the width of the interval that they gave; NaN: unknown.
 
-    The value is taken to stay, and the interval to shrink with the square root of their number. A
-    positive interval is measured in logs.
+    A positive interval is measured in logs.
+
+    Parameters
+    ----------
+    effect
+        Smallest effect of interest: a ratio to the criterion's limit less one, in percent of the
+        limit where the interval is not positive, or in its unit where the limit is 0.
+    band
+        Criterion. With two finite ends, the power is that of showing that a value in its middle
+        lies within; else that of deciding an effect on one side of the limit.
+    level
+        Of the interval.
+    error
+        One-sided error of the test; by default the interval's.
     """
-    spanned = [limit for limit in (at_least, at_most) if found.low < limit < found.high]
-    if n < 2 or not spanned or found.value in spanned:
-        return 0
-    if found.value < at_least or found.value > at_most:  # only the nearest limit has to be cleared
-        spanned = [min(spanned, key=lambda limit: abs(limit - found.value))]
-    scale = math.log if min(found.low, *spanned) > 0.0 else float
-    factors = [
-        (scale(found.high if limit > found.value else found.low) - scale(found.value))
-        / (scale(limit) - scale(found.value))
-        for limit in spanned
-    ]
-    return math.ceil(round(n * max(factors) ** 2, 6)) - n
+    is_log = found.low > 0.0 and all(end > 0.0 for end in band if math.isfinite(end))
+    scale = math.log if is_log else float
+    half = (scale(found.high) - scale(found.low)) / 2.0 if math.isfinite(found.low) else math.nan
+    if not half > 0.0 or not math.isfinite(half):
+        return math.nan
+    z = float(stats.norm.ppf(0.5 + level / 2.0))
+    limit = float(stats.norm.isf(error)) if error else z
+    if all(map(math.isfinite, band)):
+        reach = (scale(band[1]) - scale(band[0])) / 2.0
+        return float(max(2.0 * stats.norm.cdf(reach * z / half - limit) - 1.0, 0.0))
+    ends = [abs(end) for end in band if math.isfinite(end)]
+    size = math.log1p(effect) if is_log else effect * (ends[0] if ends and ends[0] > 1e-6 else 1.0)
+    return float(stats.norm.cdf(size * z / half - limit))
+
+
+def effect_in_words(effect: float) -> str:
+    """An effect that is a share of a limit, in words."""
+    return f"an effect of {100.0 * effect:.3g} %"
 
 
 def holds(condition: bool) -> Verdict:
@@ -212,7 +240,8 @@ def judge_bounds(
     at_most: float = math.inf,
     *,
     criterion: str = "",
-    n: int = 0,
+    effect: float = SMALLEST_EFFECT,
+    level: float = 0.95,
 ) -> Claim:
     """Judge an interval against [at_least, at_most]; the criterion is these bounds in words.
 
@@ -220,15 +249,20 @@ def judge_bounds(
     ----------
     criterion
         Other words for the bounds.
-    n
-        Recordings that the interval comes from; 0: it does not narrow with their number.
+    effect, level
+        As for `power_of`.
     """
     words = f"at least {at_least:g}" if at_least > -math.inf else f"at most {at_most:g}"
     if -math.inf < at_least and at_most < math.inf:
         words = f"within {at_least:.3g} and {at_most:g}"
     verdict = judge_interval(found, at_least, at_most)
-    more = more_to_settle(found, n, at_least, at_most)
-    return Claim(about, statistic, found, criterion or words, verdict, more=more)
+    band = at_least, at_most
+    power = power_of(found, effect, band, level=level)
+    is_share = max(abs(end) for end in band if math.isfinite(end)) > 1e-6
+    seen = effect_in_words(effect) if is_share else f"an effect of {effect:.2g}"
+    if all(map(math.isfinite, band)):
+        seen = EQUIVALENCE
+    return Claim(about, statistic, found, criterion or words, verdict, effect=seen, power=power)
 
 
 def judge_lower(about: Subject, statistic: str, first: ArrayLike, second: ArrayLike) -> Claim:
@@ -240,26 +274,18 @@ def judge_lower(about: Subject, statistic: str, first: ArrayLike, second: ArrayL
     """
     above, below = np.asarray(first, float), np.asarray(second, float)
     n, ratio = len(above), log_ratio_interval(above, below)
+    effect, power = effect_in_words(SMALLEST_EFFECT), power_of(ratio, error=0.01)
     p = 1.0 if np.array_equal(above, below) else wilcoxon_p(above, below)
-    verdict, more = Verdict.UNDECIDED, 0
+    verdict = Verdict.UNDECIDED
     if n >= 2 and p < 0.01 and float(np.median(np.log(above) - np.log(below))) < 0.0:
         verdict = Verdict.REPRODUCED
     elif n >= 2 and ratio.low >= 1.0:
         verdict = Verdict.NOT_REPRODUCED
-    elif n >= 2 and ratio.value < 1.0:
-        more = max(more_by_p(n, p, 0.01), 1)
-    elif n >= 2:
-        more = more_to_settle(ratio, n, at_most=1.0)
     criterion, reason = "median below 1, Wilcoxon p < 0.01", f"p = {p:.2g}"
-    return Claim(about, statistic, ratio, criterion, verdict, reason, more=more, facts={"p": p})
-
-
-def more_by_p(n: int, p: float, limit: float) -> int:
-    """How many more than n recordings would bring a test's one-sided p down to the limit.
-
-    P = 0.01 is 2.33 standard errors away, and p = 0.05 1.64.
-    """
-    return math.ceil(n * float((stats.norm.isf(limit) / max(stats.norm.isf(p), 0.1)) ** 2)) - n
+    return Claim(
+        about, statistic, ratio, criterion, verdict, reason,
+        effect=effect, power=power, facts={"p": p},
+    )  # fmt: skip
 
 
 def judge_equivalent(
@@ -271,4 +297,4 @@ def judge_equivalent(
     """
     ratio = log_ratio_interval(first, second, level=0.90)
     low, high = 1.0 / (1.0 + margin), 1.0 + margin
-    return judge_bounds(about, f"{statistic} (90 % interval)", ratio, low, high, n=np.size(first))
+    return judge_bounds(about, f"{statistic} (90 % interval)", ratio, low, high, level=0.90)

@@ -13,7 +13,15 @@ from typing import Any
 from jinja2 import Environment, StrictUndefined
 
 from experiments.evaluation.statistics import Interval
-from experiments.judging.claim import Claim, Role, Verdict, headline_verdict, select, select_all
+from experiments.judging.claim import (
+    EQUIVALENCE,
+    Claim,
+    Role,
+    Verdict,
+    headline_verdict,
+    select,
+    select_all,
+)
 
 
 @dataclass(frozen=True)
@@ -28,13 +36,13 @@ class Conclusion:
 def conclude(claims: Iterable[Claim], findings: Mapping[str, Any]) -> list[Conclusion]:
     """Give each claim its verdict, which follows from its headlines alone, and its sentence.
 
-    Without headlines a claim is shown. If it is undecided, the sentence also says how many more
-    recordings would settle it.
+    Without headlines a claim is shown. If it is undecided, the sentence also says with what power
+    data of that size decide.
 
     Parameters
     ----------
     findings
-        `sentences`, a template by the claim's id, and `unit`, what intervals narrow with.
+        `sentences`, a template by the claim's id.
     """
     by_id: dict[str, list[Claim]] = {}
     for claim in claims:
@@ -44,7 +52,7 @@ def conclude(claims: Iterable[Claim], findings: Mapping[str, Any]) -> list[Concl
         verdict = headline_verdict([(row.role, row.verdict) for row in rows])
         said = sentence(findings["sentences"][key], rows)
         if verdict is Verdict.UNDECIDED:
-            said += more_needed(rows, findings.get("unit", "recordings"))
+            said += power_stated(rows)
         conclusions.append(Conclusion(key, verdict, said))
     return conclusions
 
@@ -55,15 +63,17 @@ def sentence(template: str, rows: Sequence[Claim]) -> str:
     return " ".join(_ENVIRONMENT.from_string(template).render(names).split())
 
 
-def more_needed(rows: Sequence[Claim], unit: str) -> str:
-    """Say how many more recordings would settle an undecided claim; empty if that is unknown."""
+def power_stated(rows: Sequence[Claim]) -> str:
+    """Say what power an undecided claim's data have; empty if that is unknown."""
     open_ones = select_all(rows, role=Role.HEADLINE, verdict=Verdict.UNDECIDED)
-    more = max(row.more for row in open_ones)
-    if not more:
+    known = [row for row in open_ones if math.isfinite(row.power)]
+    if not known:
         return ""
-    what = "it" if all(row.more for row in open_ones) else "what is open"
-    units = unit.removesuffix("s") if more == 1 else unit
-    return f" About {_rounded(more)} more {units} would settle {what}."
+    least = min(known, key=lambda row: row.power)
+    what = f"decide {least.effect}"
+    if least.effect == EQUIVALENCE:
+        what = "show equivalence, if there is no difference,"
+    return f" Data of this size {what} with a power of {min(least.power, 0.99):.2f}."
 
 
 def plain(number: float | Interval, digits: int = 2) -> str:
@@ -101,9 +111,3 @@ def span(claims: Sequence[Claim]) -> str:
 
 _ENVIRONMENT = Environment(undefined=StrictUndefined, autoescape=False)
 _ENVIRONMENT.filters |= {each.__name__: each for each in (plain, percent, bracketed, ends, span)}
-
-
-def _rounded(number: int) -> int:
-    """Two leading digits of a positive number, rounded up."""
-    unit: int = 10 ** max(len(str(number)) - 2, 0)
-    return -(-number // unit) * unit

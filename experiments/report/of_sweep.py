@@ -78,7 +78,10 @@ def plot_of(rows: pd.DataFrame, name: str, panels: Panels, out: Path) -> Panels:
         panels = replace(panels, x=x)
         if not taken:
             panels = replace(panels, by=others[:1], col=next(iter(others[1:]), None))
-    save_figure(sweep_figure(rows, **vars(panels)), out)
+    try:
+        save_figure(sweep_figure(rows, **vars(panels)), out)
+    except (ValueError, OverflowError) as error:  # of Matplotlib, for 1e308 or so
+        raise InputError(f"{out}: cannot be drawn ({error}); leave some rows out") from error
     return panels
 
 

@@ -110,7 +110,10 @@ def recommend(overrides: Sequence[str]) -> str:
         lines += found.lines(fits, shown)
         shown.update(found.rows)
     if not rows:
-        lines += ["No tables of results are here (they come with a clone): nothing is measured.", ""]
+        lines += [
+            "No tables of results are here (they come with a clone): nothing is measured.",
+            "",
+        ]
     lines += _needed(each for each in everyone if each.missing)
     return "\n".join([*lines, *_to_be_sure(overrides, fits, nearest)])
 

@@ -36,6 +36,7 @@ from experiments.sweeps.collect import (
 )
 from experiments.sweeps.commands import commands, config_dir_option, noted_config_dir
 from experiments.sweeps.summary import ERROR, summary
+from experiments.sweeps.until import read_decided
 from sim.errors import printable, require
 from sim.files import write_text
 from sim.yaml_file import read_yaml
@@ -87,7 +88,7 @@ def write_sweep_page(
     }
     given = config_dir_option(config_dir or noted_config_dir(folder))
     options = f" {shlex.join(given)}" if given else ""
-    runs = extremes(table)
+    runs, decided = extremes(table), read_decided(folder)
     found = summary(table)
     means = written(shown(found), HTML, DIGITS)
     drawn_by = list(dict.fromkeys([*telling_apart, REPEAT]))
@@ -97,8 +98,10 @@ def write_sweep_page(
     text = render(
         "sweep.html",
         name=name,
+        called=shlex.quote(name),
         n_runs=len(table),
         unfinished=unfinished_sweeps(folder),
+        decided=decided and {**decided, "metric": titled(decided["metric"])},
         controls=_controls(every, drawn_by, settings, metrics),
         filters=[
             (i, each["title"], each["words"])
@@ -108,11 +111,12 @@ def write_sweep_page(
         data=_as_json(
             {
                 "spec": read_yaml(TEMPLATES / "chart.yaml"),
+                "narrowing": _narrowing(decided),
                 "settings": settings,
                 "metrics": [_metric(every[c], c, place) for c in metrics],
                 "revised": (every[PATH] == "revised").astype(int).tolist(),
                 "t975": stats.t.ppf(0.975, np.arange(1, 200)).round(4).tolist(),
-                "name": name,
+                "called": shlex.quote(name),
                 "options": options,
                 "pictures": pictures,
                 "keys": [short_key(row) for _, row in table[["run_key", REPEAT]].iterrows()],
@@ -139,6 +143,21 @@ def write_sweep_page(
         constant=_constant(table),
     )
     write_text(out, text)
+
+
+def _narrowing(decided: Mapping[str, Any] | None) -> dict[str, Any] | None:
+    """Chart of the intervals of a sweep that ran until it was decided, as Vega-Lite; else None."""
+    if decided is None:
+        return None
+    spec: dict[str, Any] = read_yaml(TEMPLATES / "narrowing.yaml")
+    rows = [
+        {**vars(each), "pair": f"{each.arm} over {each.against}"}
+        for each in decided["comparisons"]
+        if math.isfinite(each.low)
+    ]
+    margin = 1.0 + decided["margin"]
+    spec["params"] = [{"name": "margin", "value": margin}]
+    return {**spec, "data": {"values": rows}} if rows else None
 
 
 def _controls(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import os
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -13,12 +14,13 @@ from typing import Any
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Override
+from hydra.core.override_parser.types import ChoiceSweep, Override
 from omegaconf import DictConfig, ListConfig, OmegaConf
-from omegaconf.errors import InterpolationKeyError
+from omegaconf.errors import InterpolationKeyError, OmegaConfBaseException
 
 from experiments.runs import paths
 from experiments.runs.calibration import read_calibration
+from experiments.runs.console import TRUSTING
 from experiments.runs.key import digest_of
 from experiments.runs.schema import (
     GROUPS,
@@ -30,10 +32,12 @@ from experiments.runs.schema import (
     leaves,
     value_at,
 )
+from experiments.runs.targets import named_code
 from sim.errors import InputError, describe_unknown, require
-from sim.files import write_text
+from sim.files import read_text, write_text
 from sim.yaml_file import read_yaml
 
+_SEARCHED = "hydra.searchpath="
 _READ_OF_HYDRA = ("hydra/launcher", "hydra.launcher", "hydra.searchpath")
 _REMEDIES = {  # by the beginning of a setting that nothing reads
     "hydra/sweeper": "-m runs every combination of the values; an optimizer may call estima.sweep "
@@ -97,13 +101,29 @@ class Composer:
 
     Parameters
     ----------
-    extra
-        Overrides of every configuration, such as `searched` gives.
+    words
+        The user's overrides, which may name study files.
+    data
+        Further overrides, from a row or a suite's file. Neither they nor study files may name code.
+    source
+        Where `data` come from.
     """
 
-    def __init__(self, extra: Sequence[str] = ()) -> None:
-        check_overrides(extra)
-        self.extra = list(extra)
+    def __init__(
+        self, words: Sequence[str] = (), data: Sequence[str] = (), source: object = ""
+    ) -> None:
+        named, studies = name_study_files(words)
+        others, more = name_study_files(data)
+        studies |= more
+        self._source = source if data else next(iter(studies), None)
+        self._own = frozenset(_code_of_user(named) if self._source is not None else ())
+        searching = [word for word in [*named, *others] if word.startswith(_SEARCHED)]
+        check_overrides(searching)
+        self.words = [word for word in [*named, *others] if word not in searching]
+        self.extra = _merged(
+            [*searching, *(searched(folder)[0] for folder in studies.values())],
+            only_folders=bool(data),
+        )
         self.parse = functools.lru_cache(maxsize=4096)(parse_override)
         self._is_group: dict[str, bool] = {}
         self._bases: dict[tuple[str, ...], Composed] = {}
@@ -118,15 +138,42 @@ class Composer:
         """
         check_overrides(overrides)
         each = [self.parse(override) for override in overrides]
+        for key in [o.key_or_group for o in each] if self._source is not None else ():
+            require(not key.startswith("hydra"), f"{self._source}: {key} cannot be set by a file")
         options, plain = ([o for o in each if self.is_plain(o) == kind] for kind in (False, True))
         base = self._base(options, [o for o in plain if o.key_or_group.endswith("_target_")])
         _check_calibrated(each)
         cfg = base.cfg.copy()
         for override in plain:
             set_value(cfg, override.key_or_group, override.value())
+        self._check(cfg)
         if any(isinstance(o.value(), dict) for o in plain):
             fill(cfg)
         return Composed(cfg, base.choices, base.params)
+
+    def _check(self, cfg: DictConfig) -> None:
+        """Check what data name, before anything that it names is imported."""
+        if self._source is not None:
+            try:
+                self.check_values(OmegaConf.to_container(cfg, resolve=True))
+            except OmegaConfBaseException:  # a key that is given later
+                self.check_values(OmegaConf.to_container(cfg, resolve=False))
+
+    def check_values(self, tree: Any) -> None:
+        """Check that what data put into a configuration names no code.
+
+        Raises
+        ------
+        InputError
+            If it does, and the user has not said that it is trusted.
+        """
+        if self._source is None or os.environ.get(paths.TRUST):
+            return
+        strange = named_code(tree) - _targets_of_conf() - self._own
+        require(
+            not strange,
+            f"{self._source} names code to run, {min(strange, default='')}; {TRUSTING}",
+        )
 
     def _base(self, options: Sequence[Override], targets: Sequence[Override]) -> Composed:
         """The configuration of some options, and of targets in place of theirs, filled up."""
@@ -138,8 +185,14 @@ class Composer:
             _check_added(options, {choice.partition("@")[0] for choice in choices})
             OmegaConf.set_struct(cfg, False)
             del cfg["hydra"]
+            require(
+                not isinstance(cfg.get("study"), DictConfig),
+                f"study={choices.get('study')}: its keys would not be those of the run; make its "
+                "first line `# @package _global_`",
+            )
             for override in targets:
                 set_value(cfg, override.key_or_group, override.value())
+            self._check(cfg)
             fill(cfg)
             for override in options:
                 deleted = override.is_delete() and value_at(cfg, override.key_or_group) is not None
@@ -162,10 +215,51 @@ class Composer:
 
 
 @contextmanager
-def open_composer(extra: Sequence[str] = ()) -> Iterator[Composer]:
-    """Yield a composer of the project's configuration."""
+def open_composer(
+    words: Sequence[str] = (), data: Sequence[str] = (), source: object = ""
+) -> Iterator[Composer]:
+    """Yield a composer of the project's configuration and of words; see `Composer`."""
     with initialize_config_dir(str(paths.CONF), version_base="1.3"):
-        yield Composer(extra)
+        yield Composer(words, data, source)
+
+
+def _merged(searching: Sequence[str], *, only_folders: bool) -> list[str]:
+    """One override in place of several that make Hydra look for options elsewhere too."""
+    places = [place for word in searching for place in _places(parse_override(word))]
+    for place in places if only_folders else ():
+        require(place.startswith("file://"), f"hydra.searchpath: {place} is not a folder")
+    return [f"{_SEARCHED}[{','.join(map(paths.quoted, places))}]"] if places else []
+
+
+@functools.cache
+def _targets_of_conf() -> frozenset[str]:
+    """Every class and function that a file of conf/ names; data may name them too."""
+    texts = (path.read_text(encoding="utf-8") for path in paths.CONF.rglob("*.yaml"))
+    return frozenset(name for text in texts for name in re.findall(r"_target_: *([\w.]+)", text))
+
+
+def _places(override: Override) -> list[str]:
+    """Folders in which an override makes Hydra look; none of another override."""
+    value = override.value() if override.key_or_group == "hydra.searchpath" else None
+    return list(map(str, value)) if isinstance(value, list) else []
+
+
+def _code_of_user(words: Sequence[str]) -> Iterator[str]:
+    """Code that the user names: in words, by the options they choose, in folders of options."""
+    for override in map(parse_override, words):
+        key, values = override.key_or_group, [override.value()]
+        if isinstance(values[0], ChoiceSweep):
+            texts = override.sweep_string_iterator()
+            values = [parse_override(f"{key}={text}").value() for text in texts]
+        for value in values:
+            yield from named_code({key.rpartition(".")[2]: value})
+            if key in GROUPS and isinstance(value, str):
+                option = paths.CONF / key / f"{value}.yaml"
+                yield from named_code(read_yaml(option)) if option.is_file() else ()
+        for place in _places(override):
+            folder = Path(place.removeprefix("file://"))
+            for path in (path for group in GROUPS for path in (folder / group).rglob("*.yaml")):
+                yield from named_code(read_yaml(path))
 
 
 def find_option(group: str, name: str, config_dir: str | Path | None = None) -> str:
@@ -177,8 +271,8 @@ def find_option(group: str, name: str, config_dir: str | Path | None = None) -> 
 
 def compose_options(overrides: Sequence[str]) -> DictConfig:
     """A configuration, not resolved, of overrides that may name a study's file."""
-    with open_composer() as composer:
-        return composer.compose(name_study_files(overrides)).cfg
+    with open_composer(overrides) as composer:
+        return composer.compose(composer.words).cfg
 
 
 def parse_override(text: str) -> Override:
@@ -245,33 +339,36 @@ def searched(config_dir: str | Path | None) -> list[str]:
                 f"{path}: an option holds keys and their values",
             )
             _check_hydra_of(path, option)
-    return [f"hydra.searchpath=[{paths.quoted(f'file://{folder}')}]"]
+    return [f"{_SEARCHED}[{paths.quoted(f'file://{folder}')}]"]
 
 
-def name_study_files(overrides: Sequence[str]) -> list[str]:
-    """Overrides in which `study=FILE.yaml` is a name, and the folder in which Hydra looks for it.
+def name_study_files(overrides: Sequence[str]) -> tuple[list[str], dict[Path, Path]]:
+    """Overrides in which `study=FILE.yaml` is a name, and by file the folder that has its copy.
 
-    Hydra knows an option by its name in a folder of its group, so a study that lies elsewhere is
-    copied to one.
+    Hydra knows an option by its name in a folder of its group. A file of conf/ is an option.
 
     Raises
     ------
     InputError
-        If the file does not exist.
+        If the file does not exist, or its keys would not be those of the configuration.
     """
     named: list[str] = []
+    copies: dict[Path, Path] = {}
     for override in overrides:
         path = Path(override.removeprefix("study="))
         if not override.startswith("study=") or path.suffix != ".yaml":
             named.append(override)
             continue
-        require(path.is_file(), f"{override}: no such file")
-        place, copies = path.resolve(), paths.results() / "cache" / "studies"
-        if place.parent.name != "study":
-            place = copies / digest_of(path)[:16] / "study" / path.name
-            write_text(place, path.read_text())
-        named += [*searched(place.parents[1]), f"study={path.stem}"]
-    return named
+        require(path.exists(), f"{override}: no such file")
+        place, own = path.resolve(), paths.CONF.resolve() / "study"
+        if place.is_relative_to(own):
+            named.append(f"study={place.relative_to(own).with_suffix('').as_posix()}")
+            continue
+        text = read_text(path)
+        copies[path] = paths.results() / "cache" / "studies" / digest_of(path)[:16]
+        write_text(copies[path] / "study" / path.name, text)
+        named.append(f"study={path.stem}")
+    return named, copies
 
 
 def _check_hydra_of(path: Path, option: Mapping[str, Any]) -> None:

@@ -1,13 +1,15 @@
 """Terminal output: progress, and the one line that ends a failed command."""
 
+import errno
 import math
+import os
 import signal
 import sys
 import textwrap
 import time
 import traceback
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext, suppress
 from typing import Any, NoReturn, TextIO
 
 from experiments.runs.paths import option_names
@@ -17,6 +19,9 @@ _QUIET_S = 2.0  # what ends sooner shows no progress
 _LINE_EVERY_S = 10.0  # where the output is a file
 # A time left is shown once there is a rate to judge it by
 _RATED_S, _RATED_SHARE, _RATED_UNITS = 10.0, 0.05, 10
+
+
+TRUSTING = "if you trust where it comes from, add --trust (docs/security.md)"
 
 
 class RunFailedError(Exception):
@@ -121,7 +126,8 @@ def exit_with(error: BaseException) -> NoReturn:
     for link in chain:
         if isinstance(link, InputError):
             _say(str(link), 2)
-        if isinstance(link, RunFailedError):
+        programs = sys.modules.get("estimators.programs.program")
+        if isinstance(link, (RunFailedError, getattr(programs, "ProgramError", RunFailedError))):
             _say(f"the run failed: {link}", 1)
         if isinstance(link, KeyboardInterrupt):
             for again in (signal.SIGINT, signal.SIGTERM):  # what is said is said whole
@@ -133,10 +139,24 @@ def exit_with(error: BaseException) -> NoReturn:
             lines = [line.strip() for line in str(link).splitlines() if line.strip()]
             text = textwrap.shorten(" ".join(lines), 600, placeholder=" ...")
             _say(f"configuration: {text}; see estima run --cfg job", 2)
+        if isinstance(link, OSError) and link is error:
+            _say_system(link)
+        if isinstance(link, MemoryError):
+            _say(f"not enough memory: {str(link) or 'nothing said'}; ask for less at once", 1)
         if isinstance(link, RecursionError) and _in_defaults(link):
             _say("configuration: the defaults of an option lead back to itself", 2)
     traceback.print_exception(error)
     sys.exit(3)
+
+
+def _say_system(error: OSError) -> NoReturn:
+    """End with what the system says of a file; or of the output, which may be a closed pipe."""
+    if error.filename is not None:
+        _say(f"{error.filename}: {error.strerror}; check its name and your rights", 2)
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # else Python tries again when it ends
+    if error.errno == errno.EPIPE:  # whoever reads has seen enough
+        sys.exit(1)
+    _say(f"the system says: {error.strerror or error}", 1)
 
 
 def _in_defaults(error: BaseException) -> bool:
@@ -188,4 +208,5 @@ def _say(message: str, code: int) -> NoReturn:
 def _write(text: str, stream: TextIO) -> None:
     """Print text with ? for what the stream's encoding lacks."""
     encoding = stream.encoding or "utf-8"
-    print(text.encode(encoding, "replace").decode(encoding), file=stream)
+    with suppress(OSError) if stream is sys.stderr else nullcontext():  # nowhere else to say it
+        print(text.encode(encoding, "replace").decode(encoding), file=stream, flush=True)

@@ -12,7 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import ThreadpoolController
 
-from estimators.base import Answer, Estimate, Estimator, Prior, run, run_and_finish
+from estimators.base import (
+    Answer,
+    Estimate,
+    Estimator,
+    Prior,
+    explain_unsound,
+    run,
+    run_and_finish,
+)
 from estimators.team import run_team
 from experiments.evaluation.map_quality import landmark_errors
 from experiments.evaluation.metrics import (
@@ -24,6 +32,7 @@ from experiments.evaluation.metrics import (
 from experiments.runs.columns import OF_THE_RUN, REVISED, Average, average_of
 from experiments.runs.experiment import Experiment
 from experiments.runs.objects import Objects
+from experiments.runs.processes import is_interrupt
 from experiments.runs.row import GAP, Outcome, Row, Status
 from experiments.runs.seeds import stream
 from sim.arrays import Array
@@ -35,6 +44,7 @@ from sim.team import Team
 _ADDED = ("stamps_scored", "stamps_left_out", "step_time_us")  # over the robots
 _STREAMS = 100  # of a run's filters
 REMARKED_PAUSE_S = 1.0  # without a pose
+_SPARSE = 5.0  # times the longest step of the recording: a path that chooses its poses
 
 Streams = Callable[[int], np.random.Generator]
 Planted = Callable[[Estimator, int], AbstractContextManager[object]]
@@ -50,7 +60,7 @@ def evaluate(
     planted: Planted | None = None,
     shown: Shown | None = None,
     on_estimate: Callable[[Recording, int, Estimate, Estimate | None], None] = lambda *_: None,
-    on_error: Callable[[Exception | SystemExit], None] = lambda _: None,
+    on_error: Callable[[BaseException], None] = lambda _: None,
 ) -> list[Row]:
     """Run an experiment's estimator `repeats` times over its recordings, and score each run.
 
@@ -107,7 +117,9 @@ def evaluate(
                 status, scores = status_of_team(statuses), scores_of_team(read, every)
         except InputError:
             raise
-        except (Exception, SystemExit) as error:
+        except BaseException as error:
+            if is_interrupt(error):
+                raise
             status = Status.of_error(error)
             on_error(error)
         else:
@@ -219,11 +231,14 @@ def status_of(recording: Recording, online: Estimate, revised: Estimate | None =
     if online.status == "ok" and not sound.any():
         return Status(Outcome.FAILED, "not_finite", "no pose at any time: it was never placed")
     if online.status == "ok" and not sound.all():
-        when = online.stamps[np.argmin(sound)]
-        return Status(Outcome.FAILED, "not_finite", f"not finite at {when:.2f} s")
-    pauses = [
-        status_of_pauses(recording, path.stamps) for path in (online, revised) if path is not None
-    ]
+        step = int(np.argmin(sound))
+        detail = f"not finite at {online.stamps[step]:.2f} s, step {step}"
+        return Status(Outcome.FAILED, "not_finite", detail)
+    paths = [path for path in (online, revised) if path is not None]
+    for path in paths:
+        if why := explain_unsound(path):
+            return Status(Outcome.FAILED, "unsound", f"{path.kind}: {why}")
+    pauses = [status_of_pauses(recording, path.stamps) for path in paths]
     worst = max(pauses, key=lambda status: status.code)
     if online.status == "ok":
         return worst
@@ -243,8 +258,12 @@ def status_of_pauses(recording: Recording, stamps: Array) -> Status:
         start, end = max(start, known[0]), min(end, known[-1])
         own_s = max(own_s, float(np.diff(known).max(initial=0.0)))
     pause_s = longest_pause_s(stamps, start, end)
+    usual_s = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
     if pause_s <= max(REMARKED_PAUSE_S, own_s):
-        return Status()
+        if usual_s <= _SPARSE * own_s:
+            return Status()
+        sparse = f"a pose every {usual_s:.3g} s, where the recording allows one every {own_s:.3g} s"
+        return Status(Outcome.REMARK, GAP, sparse)
     return Status(Outcome.REMARK, GAP, f"no pose for {pause_s:.3g} s of the recording")
 
 

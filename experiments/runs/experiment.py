@@ -14,18 +14,21 @@ from typing import Any
 from omegaconf import OmegaConf
 
 from estimators.base import Estimator
+from estimators.programs.host import Isolated
 from estimators.programs.offline import needs_of
 from experiments.runs import paths
-from experiments.runs.compose import name_study_files, open_composer
+from experiments.runs.compose import open_composer
 from experiments.runs.key import origin_columns, run_key
 from experiments.runs.objects import OF_TEAMS, Objects, is_grid_file
 from experiments.runs.row import Row
 from experiments.runs.schema import (
     OPTIONS,
+    RUN_KEYS,
     Config,
     Leaf,
     RunOptions,
     check_shape,
+    is_ours,
     with_leaf,
 )
 from experiments.runs.seeds import stream
@@ -42,10 +45,18 @@ class Experiment(Objects):
     """A world, a robot, its sensors and route, or a recording of them; and an estimator."""
 
     @classmethod
-    def compose(cls, overrides: Sequence[str] = ()) -> Experiment:
-        """Compose an experiment from Hydra's overrides, such as `world=office seed=3`."""
-        with open_composer() as composer:
-            return cls(*composer.compose(name_study_files(overrides)).resolve())
+    def compose(
+        cls, overrides: Sequence[str] = (), data: Sequence[str] = (), source: object = ""
+    ) -> Experiment:
+        """Compose an experiment from Hydra's overrides, such as `world=office seed=3`.
+
+        Parameters
+        ----------
+        data, source
+            Further overrides that the user did not write, and the file that they come from.
+        """
+        with open_composer(overrides, data, source) as composer:
+            return cls(*composer.compose(composer.words).resolve())
 
     def with_values(self, **values: Any) -> Experiment:
         """Return the experiment with other values of top-level keys, such as `seed=3`."""
@@ -159,7 +170,7 @@ class Experiment(Objects):
         """
         config = self.config
         check_shape(config)
-        RunOptions(**{key: config[key] for key in ("repeats", "keep", "picture")})
+        RunOptions(**{key: config[key] for key in RUN_KEYS})
         for place, kind in OPTIONS.items():
             build(kind, config[place], place)
         self.robot()
@@ -168,6 +179,11 @@ class Experiment(Objects):
         check_target(config["world"], "world", ("rng",))
         stream(config["seed"], "slip")
         stream(config["world_seed"], "world", key="world_seed")
+        require(
+            not self.isolated or (self.own_estimator is None and self.team is None),
+            "isolated=true runs an estimator of one robot that estimator._target_ names; an object "
+            "in memory and those of a team run in this process",
+        )
         self._check_team()
         self._check_needs()
         self._check_map()
@@ -180,14 +196,21 @@ class Experiment(Objects):
         InputError
             Naming the option, and the remedy.
         """
-        check_target(self.config["estimator"], "estimator")
+        self._named_estimator()
+
+    def _named_estimator(self) -> Any:
+        """What the configuration names; in place of a stranger's that is isolated, what asks it."""
+        if self.isolated and not is_ours(self.config["estimator"]):
+            return Isolated
+        return self.own_estimator or check_target(self.config["estimator"], "estimator")
 
     def _needs(self) -> frozenset[str]:
         """Options that name a sensor the estimator cannot do without, and `map`."""
         settings = self.config["estimator"]
-        estimator = self.own_estimator or check_target(settings, "estimator")
-        if str(settings.get("_target_")).startswith("estimators."):
-            estimator = self.estimator()  # its values too; one from elsewhere may take long to make
+        estimator = self._named_estimator()
+        if is_ours(settings):
+            # its values too; one from elsewhere may take long to make
+            estimator = self.with_values(isolated=False).estimator()
         return frozenset(getattr(estimator, "needs", ()))
 
     def _needs_stated(self) -> frozenset[str]:
@@ -243,7 +266,7 @@ class Experiment(Objects):
             )
         else:
             grid_file.read_grid(known_map)
-            estimator = self.own_estimator or check_target(self.config["estimator"], "estimator")
+            estimator = self._named_estimator()
             kinds = getattr(estimator, "maps", None) or [OccupancyGrid]
             require(
                 OccupancyGrid in kinds or self.option("map_path"),
@@ -287,9 +310,7 @@ class Experiment(Objects):
                 for path in sorted((paths.CONF / "sensors").glob("*.yaml"))
                 if OmegaConf.load(path).keys() & set(names)
             ]
-            remedy = (
-                f"try sensors={', '.join(presets)}" if presets else f"add sensors.{names[0]}"
-            )
+            remedy = f"try sensors={', '.join(presets)}" if presets else f"add sensors.{names[0]}"
             raise InputError(
                 f"{who} needs a sensor {' or '.join(names)}, and "
                 f"sensors={self.choices.get('sensors')} has none; {remedy}"

@@ -12,6 +12,7 @@ from experiments.runs.row import Row
 from experiments.runs.schema import SIMULATED_KEYS, Config, Leaf, leaves
 from experiments.runs.version import SIMULATION, code_version, source_digest, version_with
 from sim.errors import InputError
+from sim.files import require_file
 from sim.worlds import grid_file
 
 _NOT_IN_KEY = ("name", "picture", "recording")
@@ -55,8 +56,9 @@ def digest_of(path: Path) -> str:
     Raises
     ------
     InputError
-        If it cannot be read.
+        If it cannot be read, or is not a file.
     """
+    require_file(path)
     try:
         return hashlib.sha256(path.read_bytes()).hexdigest()
     except OSError as error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import functools
 from collections.abc import Callable, Mapping
@@ -12,6 +13,8 @@ from typing import Any, Self, cast
 import numpy as np
 
 from estimators.base import Estimator, Prior, TeamEstimator
+from estimators.programs.host import Isolated
+from experiments.evaluation.metrics import SCORED_EXTRAS
 from experiments.runs.cache import fetch_or_make
 from experiments.runs.calibration import read_calibration
 from experiments.runs.console import warn
@@ -73,6 +76,11 @@ class Objects:
         """Digest of what decides the recording's bits: its settings, or a file's; and the code."""
         return recording_key(self.config)
 
+    @property
+    def isolated(self) -> bool:
+        """Whether the estimator runs in a child process; a program is one anyway."""
+        return bool(self.config.get("isolated")) and "command" not in self.config["estimator"]
+
     def world(self) -> World:
         """Make the world, from its own stream."""
         rng = stream(self.config["world_seed"], "world", key="world_seed")
@@ -90,7 +98,10 @@ class Objects:
 
     def estimator(self) -> Estimator:
         """Make the estimator: anything with `reset` and `step`."""
-        estimator: Estimator = self.own_estimator or make(self.config["estimator"], "estimator")
+        settings = copy.deepcopy(self.config["estimator"])
+        if self.isolated:
+            return Isolated(settings, [*SCORED_EXTRAS, *self.config["keep"]])
+        estimator: Estimator = self.own_estimator or make(settings, "estimator")
         for method in ("reset", "step"):
             require(
                 callable(getattr(estimator, method, None)),
@@ -330,9 +341,8 @@ class Objects:
             return None
         if is_grid_file(wanted):
             return grid_file.read_grid(wanted)
-        return required(
-            recording.world, "prior.map=world, but the recording has no map; set prior.map=none"
-        )
+        missing = "prior.map=world, but the recording has no map; set prior.map=none"
+        return required(recording.world, missing).as_map()
 
 
 def _true_start(recording: Recording) -> Array:

@@ -5,6 +5,9 @@ import os
 import re
 from pathlib import Path
 
+from sim.files import read_text
+
+TRUST = "ESTIMA_TRUST"  # set by --trust: data may name code
 SOURCE = Path(__file__).resolve().parents[2]  # the clone, or the site-packages of a wheel
 
 
@@ -40,7 +43,7 @@ def about(file: Path) -> dict[str, str]:
     dict
         `what` it is, the first sentence; and what it is `not_for`, the sentence after "Not for:".
     """
-    lines = file.read_text(encoding="utf-8").splitlines()
+    lines = read_text(file).splitlines()
     head = itertools.takewhile(lambda line: line.startswith("#"), lines)
     words = " ".join(line.lstrip("# ") for line in head if "@package" not in line)
     text, _, limits = words.partition(" Not for: ")

@@ -12,6 +12,16 @@ from sim.errors import InputError
 from sim.files import require_file
 
 
+class Interrupted(KeyboardInterrupt):
+    """An interrupt that was held."""
+
+
+def is_interrupt(error: BaseException) -> bool:
+    """Whether the user interrupts; an estimator may raise a KeyboardInterrupt of its own."""
+    held = signal.getsignal(signal.SIGINT) is not signal.default_int_handler
+    return isinstance(error, Interrupted if held else KeyboardInterrupt)
+
+
 @contextmanager
 def hold_interrupts() -> Iterator[Callable[..., None]]:
     """Yield a function that raises the interrupt that has come meanwhile, if any.
@@ -27,12 +37,12 @@ def hold_interrupts() -> Iterator[Callable[..., None]]:
     def hold(*_: object) -> None:
         nonlocal came
         if came:
-            raise KeyboardInterrupt
+            raise Interrupted
         came = True
 
     def check(*_: object, **__: object) -> None:
         if came:
-            raise KeyboardInterrupt
+            raise Interrupted
 
     usual = [
         number

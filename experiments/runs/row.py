@@ -13,8 +13,8 @@ from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from experiments.runs.columns import ORIGIN, STATUS
-from sim.errors import InputError, require
+from experiments.runs.columns import ORIGIN, REPEAT, STATUS
+from sim.errors import InputError, printable, require
 from sim.files import require_file, write_whole
 
 if TYPE_CHECKING:
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 Row = dict[str, str | int | float | bool | None]
 _TEXTS = (*STATUS, *ORIGIN)
+_KEY = re.compile(r"[0-9A-Za-z_-]{1,64}")  # it becomes the name of files
 WITH_DIGEST = re.compile(r".+\.([0-9a-f]{16})\.parquet")
 GAP = "gap"  # the code of a run that gave no pose for some of the drive
 
@@ -33,6 +34,9 @@ class Outcome(StrEnum):
     OK = "ok"
     REMARK = "remark"  # with something to report, such as a scan that was not used
     FAILED = "failed"
+
+
+_OUTCOMES = [each.value for each in Outcome]
 
 
 @dataclass(frozen=True)
@@ -57,7 +61,11 @@ class Status:
     @classmethod
     def of_error(cls, error: BaseException) -> Status:
         """Status of a run that an exception ended."""
-        return cls(Outcome.FAILED, type(error).__name__, str(error).replace("\n", " "))
+        try:
+            text = " ".join(str(error).splitlines())
+        except Exception:  # its __str__ fails
+            text = "its message cannot be read"
+        return cls(Outcome.FAILED, printable(type(error).__name__), printable(text))
 
     def columns(self) -> Row:
         """Return the columns of a row."""
@@ -70,11 +78,16 @@ def check_row(row: Row) -> None:
     Raises
     ------
     InputError
-        If a value is not a scalar that a table can hold, the status is missing, or a number is
-        NaN though the status is ok.
+        If a value is not a scalar that a table can hold, the status is missing or unknown, the
+        run's key is not a word, or a number is NaN though the status is ok.
     """
     for key in _TEXTS:
         require(isinstance(row.get(key), str), f"a row must have the text {key}")
+    require(row["status"] in _OUTCOMES, f"a row's status is one of {', '.join(_OUTCOMES)}")
+    require(
+        _KEY.fullmatch(str(row["run_key"])), f"row key run_key: {row['run_key']!r} is not a word"
+    )
+    require(type(row.get(REPEAT, 0)) is int, f"row key repeat: {row.get(REPEAT)!r} is not a number")
     for key, value in row.items():
         flat = value is None or isinstance(value, (str, int, float, bool))
         require(flat, f"row key {key} must hold a scalar, got {type(value).__name__}")
@@ -87,6 +100,32 @@ def check_row(row: Row) -> None:
                 f"row key {key} is {value} though the status is ok; leave out what does not apply, "
                 "or say in the status what went wrong",
             )
+
+
+def check_table(table: pd.DataFrame, path: Path) -> None:
+    """Check what `check_row` does of columns that were read: other programs write tables too.
+
+    Raises
+    ------
+    InputError
+        If a run lacks a key that can name a file, a known status, an estimator, or a whole
+        number of its repeat.
+    """
+    import pandas as pd
+
+    sound = {
+        "run_key": lambda column: column.astype(str).str.fullmatch(_KEY) & column.notna(),
+        "status": lambda column: column.isin(_OUTCOMES),
+        "choice.estimator": lambda column: column.notna(),
+        REPEAT: lambda column: pd.to_numeric(column, errors="coerce").mod(1) == 0,
+    }
+    for name in sound.keys() & {*table}:
+        good = sound[name](table[name])
+        require(
+            good.all(),
+            f"{path}: not rows of runs, column {name} holds {table[name][~good].head(1).tolist()}; "
+            "delete the file, or run the sweep again",
+        )
 
 
 def write_frame(frame: pd.DataFrame, path: Path, digits: int = 10) -> None:
@@ -194,7 +233,22 @@ def to_tables(rows: Iterable[Row]) -> list[pa.Table]:
 
         return pa.schema([(name, arrow(kind)) for name, kind in columns])
 
-    return [pa.Table.from_pylist(group, schema(columns)) for columns, group in groups.items()]
+    try:
+        return [pa.Table.from_pylist(group, schema(columns)) for columns, group in groups.items()]
+    except UnicodeEncodeError:  # half a character, in a text that some program wrote
+        return to_tables([_encodable(row) for group in groups.values() for row in group])
+
+
+def _encodable(row: Row) -> Row:
+    """The row with ? for what UTF-8 cannot hold."""
+    return {
+        _whole(name): _whole(value) if isinstance(value, str) else value
+        for name, value in row.items()
+    }
+
+
+def _whole(text: str) -> str:
+    return text.encode("utf-8", "replace").decode()
 
 
 def concatenate(tables: Sequence[pa.Table]) -> pd.DataFrame:

@@ -13,14 +13,14 @@ from estimators.base import Estimate
 from estimators.programs.program import ProgramError
 from experiments.runs import paths
 from experiments.runs.columns import COLUMNS, REVISED
-from experiments.runs.console import RunFailedError, progress, show
+from experiments.runs.console import RunFailedError, progress, show, warn
 from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
 from experiments.runs.processes import hold_interrupts
 from experiments.runs.row import Outcome, Row
 from experiments.runs.store import write_run
 from experiments.trajectories.convert import write_estimate
-from sim.errors import require
+from sim.errors import InputError, require
 from sim.recording import Recording
 from sim.team import Team, save
 
@@ -91,16 +91,30 @@ def run_once(experiment: Experiment, draw: Draw, out: Path | None = None) -> lis
             on_estimate=keep,
             on_error=_trace,
         )
-    if found and experiment.config["picture"]:
-        draw(found, experiment, folder)
+    written = (write_run(rows, folder.parent), folder / "run.png", out)
     if found and out is not None:
         write_estimate(out, found[0][1])
-    written = (write_run(rows, folder.parent), folder / "run.png", out)
+    if found and experiment.config["picture"]:
+        _draw(draw, found, experiment, folder)
     _print(rows, [file for file in written if file is not None and file.exists()])
     for row in rows:
         if row["status"] == Outcome.FAILED:
             raise RunFailedError(f"{row['status_code']}: {row['status_detail']}")
     return rows
+
+
+def _draw(
+    draw: Draw, found: Sequence[tuple[Recording, Estimate]], experiment: Experiment, folder: Path
+) -> None:
+    """Draw a run whose results are on disk; a picture that fails is a warning."""
+    try:
+        draw(found, experiment, folder)
+    except InputError:  # a full disk, say
+        raise
+    except Exception as error:
+        (folder / "run.png").unlink(missing_ok=True)  # of a run before
+        why = " ".join(f"{type(error).__name__}: {error}".split())
+        warn(f"estima: the picture is not drawn ({why}); the results are kept")
 
 
 def expected_duration_s(experiment: Experiment) -> float | None:
@@ -123,7 +137,7 @@ def record(experiment: Experiment, out: Path) -> bool:
     return all(robot.status == "ok" for robot in made.robots)
 
 
-def _trace(error: Exception | SystemExit) -> None:
+def _trace(error: BaseException) -> None:
     """Print where an error came from, unless it is a program's, whose own message says so."""
     if not isinstance(error, ProgramError):
         traceback.print_exception(error)

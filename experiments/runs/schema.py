@@ -80,6 +80,8 @@ class RunOptions:
     """Names of belief extras to record."""
     picture: bool
     """Whether a single run is drawn."""
+    isolated: bool
+    """Whether the estimator runs in a child process, which never holds the truth."""
 
 
 @options("team")
@@ -114,7 +116,8 @@ OPTIONS: dict[str, type] = {
 }
 _MAPPINGS = (*GROUPS, *OPTIONS)
 KEYS = (*_MAPPINGS, "seed", "world_seed", "recording", "calibration", "name")
-KEYS += ("repeats", "keep", "picture")
+RUN_KEYS = ("repeats", "keep", "picture", "isolated")  # of `RunOptions`
+KEYS += RUN_KEYS
 
 
 def describe_unknown_key(key: str, config: Mapping[str, Any]) -> str:
@@ -158,10 +161,16 @@ def fill(cfg: DictConfig) -> None:
     """
     for place in _places(cfg, GROUPS):
         settings = value_at(cfg, place)
-        if isinstance(settings, DictConfig):
+        hidden = place == "estimator" and cfg.get("isolated") is True
+        if isinstance(settings, DictConfig) and not (hidden and not is_ours(settings)):
             with suppress(InputError):  # `check` says it
                 filled = _filled(_target(settings, place), OmegaConf.to_container(settings))  # type: ignore[arg-type]
                 OmegaConf.update(cfg, place, filled, merge=False)
+
+
+def is_ours(settings: Mapping[str, Any]) -> bool:
+    """Whether what the settings of an estimator name belongs to this package."""
+    return str(settings.get("_target_")).startswith("estimators.")
 
 
 def value_at(cfg: DictConfig, key: str) -> Any:

@@ -28,6 +28,7 @@ from experiments.runs.row import (
     Outcome,
     Row,
     check_row,
+    check_table,
     concatenate,
     read_parquet,
     read_rows,
@@ -134,11 +135,11 @@ def read_runs(path: Path) -> pd.DataFrame:
         If there are none, or a file is damaged or holds no rows.
     """
     tables = [t for file in _files(path) for t in _tables(file)] if path.is_dir() else []
+    table = concatenate(tables) if tables else read_rows(path)
+    require(len(table), f"{path}: a table of no rows; delete it")
+    check_table(table, path)
     if not tables:
-        table = read_rows(path)
-        require(len(table), f"{path}: a table of no rows; delete it")
         return table
-    table = concatenate(tables)
     known = {"run_key", "status", REPEAT} <= set(table)
     if not known or not table.duplicated(["run_key", REPEAT]).any():
         return table
@@ -170,10 +171,11 @@ def ended(folder: Path, prefix: str = "", damaged: Any = None) -> Outcomes:
         for table in tables:
             if not set(_STATUS) <= set(table.column_names):
                 continue
+            check_table(table.to_pandas(), file)
             keys = _as_numbers(table["run_key"])
             bad = np.asarray(table["status"].to_pandas() == Outcome.FAILED.value)
             if bad.any():
-                codes, details = (table[c].to_pandas()[bad] for c in _STATUS[2:])
+                codes, details = (table[c].to_pandas()[bad].fillna("") for c in _STATUS[2:])
                 failed.update(zip(keys[bad].tolist(), codes + ": " + details, strict=True))
                 keys = keys[~np.isin(keys, keys[bad])]
             done.append(keys)
@@ -218,19 +220,19 @@ def journal_lines(content: bytes) -> Iterator[tuple[str, list[Row]]]:
             if isinstance(payload, str) and _KEY.fullmatch(payload):
                 yield payload, []
             continue
-        if not (isinstance(payload, list) and payload and all(map(_is_flat, payload))):
+        rows = payload if isinstance(payload, list) else []
+        if not rows or not all(isinstance(row, dict) for row in rows):
             continue
         if kind == _CHANGES:
-            payload = [{**basis, **changes} for changes in payload]
+            rows = [{**basis, **changes} for changes in rows]
         elif kind == _WHOLE:
-            basis, basis_crc = payload[0], crc
-        if all(isinstance(row.get("run_key"), str) for row in payload):
-            yield payload[0]["run_key"], payload
-
-
-def _is_flat(row: Any) -> bool:
-    """Whether something is a mapping to scalars."""
-    return isinstance(row, dict) and not any(isinstance(v, (list, dict)) for v in row.values())
+            basis, basis_crc = rows[0], crc
+        try:
+            for row in rows:
+                check_row(row)
+        except InputError:
+            continue
+        yield str(rows[0]["run_key"]), rows
 
 
 def has_checksum(path: Path) -> bool:

@@ -1,10 +1,11 @@
-"""Objects that a configuration names by `_target_`."""
+"""Objects that a configuration names by `_target_`, and the code that it names at all."""
 
 import inspect
+import json
 from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
-from sim.errors import InputError, describe_unknown, require
+from sim.errors import InputError, blaming, describe_unknown, require
 from sim.options import find
 
 
@@ -28,12 +29,13 @@ def make(settings: Mapping[str, Any], where: str, **injected: Any) -> Any:
     function = check_target(settings, where, injected)
     arguments = {key: value for key, value in settings.items() if key != "_target_"}
     known = inspect.signature(function).parameters
-    try:
-        return function(**arguments, **{k: v for k, v in injected.items() if k in known})
-    except (TypeError, ValueError) as error:
-        raise InputError(
-            f"{where} ({settings['_target_']}) does not accept its values: {error}"
-        ) from error
+    with blaming(f"{where} ({settings['_target_']})"):
+        try:
+            return function(**arguments, **{k: v for k, v in injected.items() if k in known})
+        except (TypeError, ValueError) as error:
+            raise InputError(
+                f"{where} ({settings['_target_']}) does not accept its values: {error}"
+            ) from error
 
 
 def check_target(
@@ -67,3 +69,17 @@ def check_target(
             bare = parameter.default is parameter.empty
             require(not bare, f"{where}.{name} is missing; {target} needs it")
     return function
+
+
+def named_code(tree: Any) -> set[str]:
+    """Every `_target_` and `command` in mappings and lists; commands as a row has them."""
+    if isinstance(tree, (list, tuple)):
+        return set().union(*map(named_code, tree))
+    if not isinstance(tree, Mapping):
+        return set()
+    here = {
+        value if isinstance(value, str) else json.dumps(value, default=str)
+        for key, value in tree.items()
+        if key in ("_target_", "command") and value not in (None, "???")  # given later
+    }
+    return here.union(*map(named_code, tree.values()))

@@ -81,7 +81,7 @@ def source_digest(target: str) -> str:
     Empty for what `code_version` covers, and for what is not found.
     """
     module, top = target.rpartition(".")[0], target.partition(".")[0]
-    if top in ("sim", "estimators"):
+    if top in ("", "sim", "estimators"):
         return ""
     spec, file = importlib.util.find_spec(top), f"{module.replace('.', '/')}.py"
     files: list[Path] = []

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,8 +13,9 @@ import pandas as pd
 from hydra.errors import HydraException, MissingConfigException
 
 from experiments.runs.columns import REPEAT, is_setting
-from experiments.runs.compose import find_option, searched
+from experiments.runs.compose import find_option, open_composer, searched
 from experiments.runs.experiment import Experiment
+from experiments.runs.schema import GROUPS
 from experiments.runs.store import read_runs
 from experiments.sweeps.collect import folder_of
 from experiments.sweeps.commands import noted_config_dir
@@ -92,16 +95,18 @@ def run_of_row(
         If this code or the options here would make another run.
     """
     settings = {str(c): row[c] for c in row.index if is_setting(str(c)) and str(c) != "name"}
-    chosen = {c.partition(".")[2]: v for c, v in settings.items() if c.startswith("choice.")}
+    source, user = f"the row of {row['run_key']}", searched(config_dir)
     if config_dir is None and noted is not None and Path(noted).is_dir():
         config_dir = noted
-    choices = [
-        f"{group}={find_option(group, name, config_dir)}"
-        for group, name in chosen.items()
-        if isinstance(name, str)
-    ]
+    choices = []
+    for group in GROUPS:
+        if isinstance(name := settings.get(f"choice.{group}"), str):
+            require(re.fullmatch(r"\w[\w.-]*", name), f"{source}: choice.{group}={name}: no option")
+            choices.append(f"{group}={find_option(group, name, config_dir)}")
+    folders = [] if user else searched(config_dir)
     try:
-        base = Experiment.compose([*searched(config_dir), *choices])
+        with open_composer(user, [*folders, *choices], source) as composer:
+            base = Experiment(*composer.compose(composer.words).resolve())
     except MissingConfigException as error:
         was = f" (the sweep's was {noted})" if noted is not None else ""
         raise InputError(
@@ -116,6 +121,7 @@ def run_of_row(
             plain = _plain(value, default) if _known(value) else None
             changed.append((tuple(name.split(".")), plain))
     again = base.with_leaves(changed)
+    composer.check_values(again.config)
     made = again.labels("")
     for name, value in settings.items():
         mine = made.get(name)
@@ -169,5 +175,6 @@ def _plain(value: Any, default: Any) -> Any:
     """
     value = value.item() if hasattr(value, "item") else value
     if isinstance(value, str) and value.startswith("["):
-        return json.loads(value)
+        with suppress(ValueError, RecursionError):  # a text that only begins so
+            return json.loads(value)
     return int(value) if isinstance(value, (str, float)) and type(default) is int else value

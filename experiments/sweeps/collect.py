@@ -23,7 +23,9 @@ from experiments.runs.console import pluralize, warn
 from experiments.runs.paths import results
 from experiments.runs.store import read_runs
 from experiments.runs.version import code_version, version_with
+from experiments.sweeps.commands import MOST_BYTES
 from sim.errors import InputError, printable, require
+from sim.files import read_text
 
 FEW = 12  # colours, and panels
 _TIMES = ["step_time_us", "cpu_time_us"]  # they differ from run to run
@@ -82,10 +84,8 @@ def collect(name: str, *, all_versions: bool = False, times: bool = False) -> pd
 
 def unfinished_sweeps(folder: Path) -> list[tuple[str, str]]:
     """Sweeps of a folder that have not ended: how many runs each has, and its command."""
-    texts = [
-        path.read_text(encoding="utf-8", errors="replace")
-        for path in sorted(folder.glob(UNFINISHED.format("*")))
-    ]
+    paths = sorted(folder.glob(UNFINISHED.format("*")))
+    texts = [read_text(path, MOST_BYTES) for path in paths]
     parts = [text.partition(" ") for text in texts]
     return [(n_runs, command.rstrip()) for n_runs, _, command in parts]
 

@@ -7,15 +7,16 @@ from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from sim.files import require_file, write_text
+from sim.files import read_text, require_file, write_text
 
+MOST_BYTES = 1 << 20  # of a folder's commands
 _OPTION = "--config-dir"
 
 
 def commands(folder: Path) -> list[str]:
     """Commands that made the rows of a folder, as the sweeps noted them."""
     path = _file(folder)
-    return path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
+    return read_text(path, MOST_BYTES).splitlines() if path.exists() else []
 
 
 def note_command(folder: Path, arguments: Sequence[str], config_dir: str | None) -> str:

@@ -6,6 +6,7 @@ workers compose nothing, and any of Hydra's launchers will do.
 
 import hashlib
 import importlib.util
+import itertools
 import json
 import os
 import platform
@@ -32,6 +33,7 @@ from experiments.runs.row import Outcome, Status
 from experiments.sweeps.collect import UNFINISHED
 from experiments.sweeps.commands import note_command
 from experiments.sweeps.plan import Numbers, Plan, make_plan
+from experiments.sweeps.until import Until
 from experiments.sweeps.work import (
     compiling_file,
     end_with,
@@ -61,7 +63,7 @@ def sweep(
         Hydra's overrides. A study's `sweeps` are a list of further ones, each with its values;
         its `hydra.sweeper.params` are swept where the arguments do not say otherwise. Those of
         `hydra/launcher` and `hydra.launcher` go to the launcher; `jobs` is the number of jobs
-        that the runs are packed into.
+        that the runs are packed into. `until` and what goes with it are for `Until.of`.
     config_dir
         A further folder of options.
     on_done
@@ -78,7 +80,7 @@ def sweep(
     launching = [a for a in arguments if a.lstrip("+~").startswith(_LAUNCHING)]
     _check_launcher(launching)
     n_jobs = _n_jobs(launching)
-    own = [a for a in arguments if a not in launching]
+    until, own = Until.of([a for a in arguments if a not in launching])
     plan = make_plan(own, config_dir)
     require(len(plan.keys), f"no runs: a value of {' '.join(own)} is an empty range or list")
     plan = plan.name_by(own, config_dir)
@@ -90,31 +92,35 @@ def sweep(
     prepare(folder)
     keys, first = np.unique(plan.keys, return_index=True)
     done = np.isin(keys, store.ended(folder, damaged=_drop).done)
-    runs = np.sort(first[~done])
-    check(plan, runs)
+    check(plan, np.sort(first[~done]))
+    blocks = until.blocks(plan, folder) if until else iter([np.sort(first)])
+    block = next(blocks)  # what is wrong with the sweep is said before its command is noted
     command = note_command(folder, arguments, config_dir)
     unfinished = folder / UNFINISHED.format(hashlib.sha256(command.encode()).hexdigest()[:8])
-    warn(f"{pluralize(len(keys), 'run')}, {done.sum()} of them done before: {paths.short(folder)}")
-    if not len(runs):
-        unfinished.unlink(missing_ok=True)
-        on_done(folder, len(keys))
-        return
-    write_text(unfinished, f"{len(keys)} {command}\n")
-    try:
-        _launch_all(plan, runs, Jobs(folder, n_jobs), launching)
-    except KeyboardInterrupt:
-        n_kept = np.isin(keys, store.ended(folder).done).sum()
-        raise KeyboardInterrupt(
-            f"interrupted; {n_kept} of {len(keys)} runs are kept: run it again to go on"
-        ) from None
+    n_runs = f"{'at most ' * bool(until)}{pluralize(len(keys), 'run')}"
+    warn(f"{n_runs}, {done.sum()} of them done before: {paths.short(folder)}")
+    wanted = []
+    for some in itertools.chain([block], blocks):
+        wanted.append(some)
+        runs = some[~np.isin(plan.keys[some], store.ended(folder).done)]
+        if not len(runs):
+            continue
+        write_text(unfinished, f"{len(keys)} {command}\n")
+        try:
+            _launch_all(plan, runs, Jobs(folder, n_jobs), launching)
+        except KeyboardInterrupt:
+            n_kept = np.isin(keys, store.ended(folder).done).sum()
+            raise KeyboardInterrupt(
+                f"interrupted; {n_kept} of {len(keys)} runs are kept: run it again to go on"
+            ) from None
+        _tidy(folder)
     unfinished.unlink(missing_ok=True)
-    _tidy(folder)
-    found = store.ended(folder)
-    on_done(folder, len(keys))
-    bad = runs[~np.isin(plan.keys[runs], found.done)]
+    every, found = np.concatenate(wanted), store.ended(folder)
+    on_done(folder, len(every))
+    bad = every[~np.isin(plan.keys[every], found.done)]
     if len(bad):
         why = found.failed.get(int(plan.keys[bad[0]]), "no row was written")
-        raise RunFailedError(f"{len(bad)} of {len(keys)} runs; first: {why}")
+        raise RunFailedError(f"{len(bad)} of {len(every)} runs; first: {why}")
 
 
 def check(plan: Plan, runs: Numbers) -> None:

@@ -27,7 +27,6 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from experiments.runs.compose import (
     Composed,
     Composer,
-    name_study_files,
     open_composer,
     searched,
     set_value,
@@ -194,6 +193,13 @@ class Plan:
             If its runs have several names.
         """
         names = {f.first.name for f in self.families}
+        swept_keys = {leaf[0] for f in self.families for axis in f.axes for leaf in axis.leaves}
+        for key in ("picture", "keep"):
+            one = len({json.dumps(f.first.label(key)) for f in self.families}) == 1
+            require(
+                one and key not in swept_keys,
+                f"{key} decides no result: give it one value, not several, in a sweep",
+            )
         swept_ = any(("name",) in axis.leaves for f in self.families for axis in f.axes)
         require(
             len(names) == 1 and not swept_,
@@ -236,10 +242,8 @@ def make_plan(arguments: Sequence[str], config_dir: str | None = None) -> Plan:
     InputError
         If an override is wrong, or a key is unknown.
     """
-    arguments = name_study_files(arguments)
-    searching = [a for a in arguments if a.lstrip("+~").startswith("hydra.")]
-    arguments = [a for a in arguments if a not in searching]
-    with open_composer([*searched(config_dir), *searching]) as composer:
+    with open_composer([*searched(config_dir), *arguments]) as composer:
+        arguments = composer.words
         given = OverridesParser.create().parse_overrides(list(arguments))
         fixed = [o.input_line or "" for o in given if not o.is_sweep_override()]
         study = composer.compose(fixed)
@@ -337,6 +341,7 @@ def _grid(
         found, axes = _composed(composer, lines, {key: choices[key] for key in inner})
         first = Experiment(*found.resolve()).with_values(picture=False)
         made = Family(first, tuple(axes[key] for key in inner))
+        composer.check_values([axis.values for axis in made.axes])
         cells = tuple(at.get(key, slice(None)) for key in choices)
         family[cells] = len(families)
         number[cells] = np.arange(math.prod(made.shape)).reshape(made.shape)
@@ -425,7 +430,7 @@ def _decides_more(leaf: Leaf, values: Sequence[Any]) -> bool:
     """Whether a leaf decides more than its own value: a file, code, or how rays are cast."""
     if leaf[0] == "estimator" or leaf[:2] == ("route", "feedback"):
         options = [] if isinstance(values, range) else list(values)
-        return leaf[-1] == "_target_" or bool(files_of_options(options))
+        return leaf[-1] in ("_target_", "command") or bool(files_of_options(options))
     files = leaf[0] in ("recording", "calibration") or leaf[:2] in (
         ("prior", "map"),
         ("world", "path"),

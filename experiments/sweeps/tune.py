@@ -286,6 +286,11 @@ def _tuned(problem: _Problem, journal: Path, jobs: int) -> TuningResult:
     Parallel(n_jobs=jobs)(delayed(_work)(journal, problem, worker) for worker in range(jobs))
     done = _opened(journal, problem).get_trials(states=_done())
     finished = sorted(done, key=lambda t: t.number)[: problem.trials]  # processes may make more
+    for trial in finished:  # a journal may come from anybody
+        sound = all(
+            k in problem.ranges and problem.ranges[k].has(v) for k, v in trial.params.items()
+        )
+        require(sound, f"{journal}: trial {trial.number} is not of this study; delete the file")
     trials = _trials(finished)
     best = finished[int(trials["mean_log_error"].idxmin())]
     values = {k: v for k, v in best.params.items() if v != default[k]}

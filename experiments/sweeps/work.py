@@ -1,12 +1,13 @@
 """One job of a sweep: its share of the plan, run by run."""
 
+import ctypes
 import os
 import platform
 import signal
 import threading
 import time
 from collections.abc import Callable, Mapping
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -14,10 +15,12 @@ from typing import Any
 from experiments.runs import store
 from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
-from experiments.runs.processes import hold_interrupts
+from experiments.runs.processes import hold_interrupts, is_interrupt
 from experiments.runs.row import Row, Status, check_row
 from experiments.sweeps.plan import Family
 from sim.team import Team
+
+_PR_SET_PDEATHSIG = 1  # of Linux
 
 
 def share_path(plan: str | Path, job: int) -> Path:
@@ -55,6 +58,9 @@ def end_with(node: str, planner: int) -> None:
             os._exit(1)
         return
 
+    with suppress(OSError, AttributeError):  # at once, also out of a call of compiled code
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+
     def watch() -> None:
         while os.getppid() == planner:
             time.sleep(0.5)
@@ -85,7 +91,9 @@ def run_and_record(experiment: Experiment, held: dict[str, Team], journal: store
             )
             for row in rows:
                 check_row(row)
-        except (Exception, SystemExit) as error:
+        except BaseException as error:
+            if is_interrupt(error):
+                raise
             rows = [failure_row(experiment, Status.of_error(error))]
     journal.append(rows)
 

@@ -140,7 +140,11 @@ def experiment_over(recording: Recording, estimator: str, overrides: Sequence[st
     robot = dataclasses.asdict(recording.robot)  # and its slip, if that is known
     made_with = recording.config.get("robot")
     if isinstance(made_with, dict):  # else, of a log of many robots, the number of one
-        robot |= {key: value for key, value in made_with.items() if key in ("kr", "kl")}
+        robot |= {
+            key: value
+            for key, value in made_with.items()
+            if key in ("kr", "kl") and isinstance(value, (int, float))
+        }
     given = [f"robot.{key}={value}" for key, value in robot.items()]
     return Experiment.compose([f"estimator={estimator}", *given, *overrides])
 

@@ -1,5 +1,6 @@
 """One run at a glance: truth and estimate in the world, and the errors with their 2-sigma bands."""
 
+import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -36,6 +37,7 @@ _N_ELLIPSES = 8
 _N_READINGS = 30
 _MOST_POINTS = 4000
 _AROUND_M = 3.0  # of the path that is shown
+_FARTHEST_M = 1e9  # that is drawn; beyond, an axis cannot be divided
 
 
 def run_figure(found: Sequence[tuple[Recording, Estimate]], name: str) -> Figure:
@@ -51,7 +53,20 @@ def run_figure(found: Sequence[tuple[Recording, Estimate]], name: str) -> Figure
     name
         Of the estimates.
     """
-    return _figure_alone(*found[0], name) if len(found) == 1 else _team_figure(found, name)
+    shown = [(recording, _finite(estimate)) for recording, estimate in found]
+    return _figure_alone(*shown[0], name) if len(found) == 1 else _team_figure(shown, name)
+
+
+def _finite(estimate: Estimate) -> Estimate:
+    """The estimate with NaN, which leaves a gap, in place of what is not finite or too far off."""
+    means, covariances = (
+        np.where(np.abs(values) < most, values, np.nan)  # False of NaN
+        for values, most in (
+            (estimate.means, _FARTHEST_M),
+            (estimate.covariances, _FARTHEST_M**2),
+        )
+    )
+    return dataclasses.replace(estimate, means=means, covariances=covariances)
 
 
 def draw_run(
@@ -78,6 +93,8 @@ def _figure_alone(recording: Recording, estimate: Estimate, name: str) -> Figure
         _draw_errors(halves[1].subplots(3, 1, sharex=True), estimate, truth)
     means = estimate.means
     shown = truth[:, :2] if recording.truth is not None else means[:, :2]
+    shown = shown[np.isfinite(shown).all(axis=1)]
+    shown = shown if len(shown) else np.zeros((1, 2))
     low, high = shown.min(axis=0) - _AROUND_M, shown.max(axis=0) + _AROUND_M
     names = drawable(recording)
     scans = [n for n in names if "ranges_m" in recording.logs[n].values]
@@ -85,9 +102,12 @@ def _figure_alone(recording: Recording, estimate: Estimate, name: str) -> Figure
         points = _points(recording, estimate, sensor)
         map_axes.plot(*points.T, ".", color=ORANGE, ms=1.5, alpha=0.6, label=f"{sensor} as placed")
     map_axes.plot(*means[:, :2].T, color=ESTIMATE, lw=1.2, ls="--", label=literal(name))
-    along = travelled_m(means)
+    sound = np.isfinite(means).all(axis=1) & np.isfinite(estimate.covariances).all(axis=(1, 2))
+    along = travelled_m(means[sound])
     some = np.searchsorted(along, np.linspace(0.0, along[-1], _N_ELLIPSES + 1)[1:])
-    some = np.unique(np.minimum(some, len(means) - 1))
+    some = (
+        np.flatnonzero(sound)[np.unique(np.minimum(some, sound.sum() - 1))] if sound.any() else []
+    )
     draw_ellipses(
         map_axes, means[some], estimate.covariances[some], "95 % ellipse",
         ec=ESTIMATE, fc=ESTIMATE, alpha=0.35, lw=0.8, zorder=3,

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sim.arrays import Array
+from sim.arrays import Array, Bools
 from sim.errors import InputError, require, required
 from sim.files import read_head
 from sim.formats.rosbag import Track
@@ -80,7 +80,7 @@ def check_track(track: Track, path: Path) -> None:
         )
 
 
-def sound_covariances(covariances: Array) -> Array:
+def sound_covariances(covariances: Array) -> Bools:
     """Which of covariances (T, 3, 3) are finite, symmetric and without a negative variance.
 
     Rounding is let pass: 1e-3 of the two standard deviations, or of the greatest variance.
@@ -93,8 +93,13 @@ def sound_covariances(covariances: Array) -> Array:
     sigma = np.sqrt(np.abs(variances))
     slack = _ROUNDING * sigma[:, :, None] * sigma[:, None, :] + 1e-12
     sound &= (np.abs(known - known.transpose(0, 2, 1)) <= slack).all(axis=(1, 2))
-    lowest, _, highest = np.linalg.eigvalsh((known + known.transpose(0, 2, 1)) / 2.0).T
-    found: Array = sound & (lowest >= -_ROUNDING * highest - 1e-12)
+    # with the slack added, its leading minors are positive (Sylvester); far faster than eigenvalues
+    a, d, f = (variances + (_ROUNDING * variances.max(axis=1) + 1e-12)[:, None]).T
+    b, c, e = ((known[:, i, j] + known[:, j, i]) / 2.0 for i, j in ((0, 1), (0, 2), (1, 2)))
+    minor = a * d - b * b
+    found: Bools = (
+        sound & (minor > 0.0) & (f * minor - a * e * e + 2.0 * b * c * e - d * c * c > 0.0)
+    )
     return found
 
 

@@ -57,6 +57,10 @@ def _arc(right_m: float, left_m: float, track_m: float) -> tuple[float, float, f
     """`robot.arc_increment` in floats: one robot's tick is too small for NumPy's calls."""
     turn = (right_m - left_m) / track_m
     half = turn / 2.0
+    require(
+        math.isfinite(half + right_m),
+        "the robot's motion is not finite; check robot.kr, robot.kl, robot.track_m and its speeds",
+    )
     small = abs(half) < SMALL_ANGLE_RAD
     chord = (right_m + left_m) / 2.0
     chord *= 1.0 - half**2 / 6.0 if small else math.sin(half) / half

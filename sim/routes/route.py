@@ -22,6 +22,8 @@ from sim.routes.feedback import CONTROL_TICKS, check_feedback
 from sim.se2 import chain, transform
 from sim.worlds.world import World, facing_second
 
+MOST_S = 1e5  # that a route by the clock lasts: each tick is an array's row
+
 Segment = tuple[float, float, float]
 Segments = Annotated[
     tuple[Annotated[Segment, Strict(False)], ...],
@@ -66,7 +68,12 @@ class OpenLoop:
         Being means, they add up to the promised distance and angle exactly.
         """
         *starts_s, end_s = self.edges_s(robot)
-        n_ticks = math.ceil((end_s + self.rest_s) / dt_s - 1e-9)
+        total_s = end_s + self.rest_s
+        require(
+            total_s <= MOST_S,
+            f"route.segments and route.rest_s last {total_s:g} s; {MOST_S:g} s are the most",
+        )
+        n_ticks = math.ceil(total_s / dt_s - 1e-9)
         edges_s = dt_s * np.arange(n_ticks + 1, dtype=np.float64)
         velocity = np.zeros((n_ticks, 2))
         for start_s, segment in zip(starts_s, self.segments, strict=True):

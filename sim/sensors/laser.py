@@ -7,6 +7,7 @@ import numpy as np
 from pydantic import Field as Bound
 
 from sim.arrays import Array, ArrayLike, Bools, Floats
+from sim.errors import require
 from sim.options import NonNegative, Positive, options
 from sim.sensors.base import Field, Mount, Probe, Reading, Schema
 
@@ -33,6 +34,9 @@ class Laser:
     """Standard deviation of the Gaussian range noise."""
     mount: Mount = Mount()
     """Where it sits on the robot."""
+
+    def __post_init__(self) -> None:
+        check_range(self)
 
     @property
     def bearings_rad(self) -> Array:
@@ -88,6 +92,15 @@ class Laser:
     def from_ros(self, message: Any) -> Reading:
         """Reading of a LaserScan."""
         return {"ranges_m": np.asarray(message.ranges, np.float32)}
+
+
+def check_range(sensor: Any) -> None:
+    """Check that a sensor's ranges begin before they end, or it would see nothing."""
+    require(
+        sensor.min_range_m < sensor.max_range_m,
+        f"{sensor._options_place}.min_range_m must be below max_range_m, or nothing is seen; got "
+        f"{sensor.min_range_m:g} and {sensor.max_range_m:g}",
+    )
 
 
 def noisy_ranges(sensor: Any, true_ranges_m: ArrayLike, rng: np.random.Generator) -> Floats:

@@ -10,7 +10,7 @@ from sim.arrays import Array, ArrayLike, Floats
 from sim.errors import require
 from sim.options import NonNegative, Positive, options
 from sim.sensors.base import Field, Mount, Probe, Reading, Schema
-from sim.sensors.laser import Beams, noisy_ranges
+from sim.sensors.laser import Beams, check_range, noisy_ranges
 
 _GROUND_M = 0.3  # points below are not drawn
 
@@ -35,6 +35,7 @@ class Lidar3D:
     mount: Mount = Mount(z_m=1.5)
 
     def __post_init__(self) -> None:
+        check_range(self)
         low, high = self.elevation_min_rad, self.elevation_max_rad
         require(
             -math.pi / 2 < low <= high < math.pi / 2,

@@ -5,9 +5,10 @@ import math
 import numpy as np
 
 from sim.arrays import Array, Floats, Ints, Values
+from sim.errors import require
 from sim.options import NonNegative, Positive, Share, options
 from sim.sensors.base import Reading, View
-from sim.sensors.stereo import StereoCamera, in_field_of_view, points_in_camera
+from sim.sensors.stereo import StereoCamera, choose, in_field_of_view, points_in_camera
 from sim.worlds.world import World
 
 
@@ -33,6 +34,13 @@ class RealCamera(StereoCamera):
     """Share of those seen that are taken for another."""
     min_distance_m: NonNegative = 0.0
     """Landmarks that are nearer are not seen."""
+
+    def __post_init__(self) -> None:
+        require(
+            self.sigma_view_descriptor == StereoCamera.sigma_view_descriptor,
+            "sensors.stereo.sigma_view_descriptor has no effect on a RealCamera, whose descriptors "
+            "have no noise; leave it out",
+        )
 
     def start(self, rng: np.random.Generator) -> "DetectingEye":  # type: ignore[override]
         """Probe that looks for the world's landmarks."""
@@ -60,6 +68,7 @@ class DetectingEye:
         ids = np.flatnonzero(in_field_of_view(camera, inside) & distant & self._found)
         origin = np.array([*camera.mount.in_map(view.pose)[:2], camera.mount.z_m])
         ids = ids[view.sees(origin, world.landmarks[ids])]
+        ids = choose(camera, ids, inside, rng)
         if not len(ids):
             return None
         reading: dict[str, Values] = {

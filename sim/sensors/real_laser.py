@@ -33,6 +33,7 @@ class RealLaser(Laser):
     firing."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         increasing = self.stamps is None or bool((np.diff(self.stamps) > 0.0).all())
         require(increasing, "sensors.laser.stamps must be numbers of seconds that increase")
 

@@ -192,7 +192,7 @@ class LandmarkEye:
         origin = np.array([*camera.mount.in_map(view.pose)[:2], camera.mount.z_m])
         ids = np.flatnonzero(in_field_of_view(camera, inside))
         ids = ids[view.sees(origin, landmarks[ids])]
-        ids = self._choose(ids, inside)
+        ids = choose(camera, ids, inside, self._rng)
         observed = camera.measure(inside[ids], self._rng)
         descriptors = self._describe(view.world, ids, origin)
         whole = np.isfinite(observed).all(axis=1)
@@ -202,27 +202,6 @@ class LandmarkEye:
             "true_ids": ids[whole].astype(np.int64),
         }
         return reading | ({"ids": reading["true_ids"]} if camera.identifies else {})
-
-    def _choose(self, ids: Ints, inside: Array) -> Ints:
-        """At most B of the visible landmarks, by the camera's rule."""
-        camera = self._camera
-        most = camera.max_observations
-        if most == 0 or len(ids) <= most:
-            return ids
-        if camera.selection == "nearest":
-            order = np.argsort(np.linalg.norm(inside[ids], axis=1), kind="stable")
-            return ids[order[:most]]
-        if camera.selection == "random":
-            return self._rng.choice(ids, most, replace=False)
-        # Farthest-point choice over the image: each next landmark is the one farthest, in
-        # pixels, from those already taken.
-        pixels = inside[ids, :2] / inside[ids, 2:]
-        taken = [int(np.argmin(np.linalg.norm(pixels, axis=1)))]
-        gap = np.linalg.norm(pixels - pixels[taken[0]], axis=1)
-        while len(taken) < most:
-            taken.append(int(np.argmax(gap)))
-            gap = np.minimum(gap, np.linalg.norm(pixels - pixels[taken[-1]], axis=1))
-        return ids[taken]
 
     def _describe(self, world: World, ids: Ints, origin: Array) -> Floats:
         """Noisy descriptors: white noise, and a drift with the change of the viewing angle."""
@@ -243,3 +222,24 @@ class LandmarkEye:
         )
         unit: Floats = (noisy / np.linalg.norm(noisy, axis=1, keepdims=True)).astype(np.float32)
         return unit
+
+
+def choose(camera: StereoCamera, ids: Ints, inside: Array, rng: np.random.Generator) -> Ints:
+    """At most B of the visible landmarks, by the camera's rule."""
+    most = camera.max_observations
+    if most == 0 or len(ids) <= most:
+        return ids
+    if camera.selection == "nearest":
+        order = np.argsort(np.linalg.norm(inside[ids], axis=1), kind="stable")
+        return ids[order[:most]]
+    if camera.selection == "random":
+        return rng.choice(ids, most, replace=False)
+    # Farthest-point choice over the image: each next landmark is the one farthest, in
+    # pixels, from those already taken.
+    pixels = inside[ids, :2] / inside[ids, 2:]
+    taken = [int(np.argmin(np.linalg.norm(pixels, axis=1)))]
+    gap = np.linalg.norm(pixels - pixels[taken[0]], axis=1)
+    while len(taken) < most:
+        taken.append(int(np.argmax(gap)))
+        gap = np.minimum(gap, np.linalg.norm(pixels - pixels[taken[-1]], axis=1))
+    return ids[taken]

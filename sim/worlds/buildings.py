@@ -16,7 +16,14 @@ from pydantic import NonNegativeInt
 from sim.arrays import Array
 from sim.errors import InputError, require, required
 from sim.options import Count, NonNegative, Positive, Share, build, options
-from sim.worlds.floor_plan import WALL_HEIGHT_M, Plan, box_corners, check_margins, rectangle_corners
+from sim.worlds.floor_plan import (
+    WALL_HEIGHT_M,
+    Plan,
+    box_corners,
+    check_cells,
+    check_margins,
+    rectangle_corners,
+)
 from sim.worlds.grid_file import read_grid
 from sim.worlds.town import lawn, terrace, town
 from sim.worlds.world import World, facing_second
@@ -134,6 +141,7 @@ class Rooms:
             self.n_x * self.n_y >= 2,
             f"world.n_x and n_y must make at least two rooms, got {self.n_x} x {self.n_y}",
         )
+        check_cells(self.n_x, self.n_y)
         room_m, door_m = self.room_m, self.door_m
         check_margins(room_m=room_m - 2.0, door_m=door_m - 0.7, wall=room_m - door_m)
 

@@ -12,6 +12,7 @@ from sim.worlds.world import World, facing_second
 
 WALL_HEIGHT_M = 2.5
 DESCRIPTOR_SIZE = 128
+_MOST_CELLS, _MOST_LANDMARKS = 2_500, 1_000_000  # of a world
 _APART_M = 0.12  # between furniture and walls, and among furniture
 _PROUD_M = 0.01  # landmarks stand this far off their face, so that rays see them from its side
 
@@ -202,7 +203,10 @@ class Plan:
 
     def _landmarks(self, rng: np.random.Generator, count: int, on_walls_share: float) -> Array:
         """Landmarks (count, 3), spread over walls and objects by the faces' lengths."""
-        require(count >= 0, f"world.n_landmarks must be zero or more, got {count}")
+        require(
+            0 <= count <= _MOST_LANDMARKS,
+            f"world.n_landmarks must be from zero to {_MOST_LANDMARKS}, got {count}",
+        )
         require(
             0.0 <= on_walls_share <= 1.0,
             f"world.on_walls_share must lie in [0, 1], got {on_walls_share}",
@@ -350,6 +354,14 @@ def make_descriptors(
             raw[rows[-1]] = raw[rows[0]]
     unit = raw / np.linalg.norm(raw, axis=1, keepdims=True) if count else raw
     return unit.astype(np.float32), alike
+
+
+def check_cells(n_x: int, n_y: int) -> None:
+    """Check that a grid of rooms or blocks is one that can be built: InputError."""
+    require(
+        n_x * n_y <= _MOST_CELLS,
+        f"world.n_x and n_y make {n_x * n_y} rooms or blocks; {_MOST_CELLS} are the most",
+    )
 
 
 def check_margins(**margins: float) -> None:

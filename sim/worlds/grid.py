@@ -129,8 +129,8 @@ def rasterize(world: World, resolution_m: float, z_m: float) -> OccupancyGrid:
 
     Occupied is every cell within a quarter of a cell of a wall: a wall near a border takes the
     cells on both sides, so that their middle is off by a quarter of a cell at most. Free is what
-    can be reached from the start pose and the way-points; the rest, such as what lies outside or
-    inside furniture, is unknown.
+    can be reached from the start pose and the way-points, or of a map without them the largest
+    floor; the rest, such as what lies outside or inside furniture, is unknown.
 
     Raises
     ------
@@ -160,6 +160,8 @@ def rasterize(world: World, resolution_m: float, z_m: float) -> OccupancyGrid:
     places = np.floor((starts - corner) / resolution_m).astype(np.int64)
     places = places[np.all((places >= 0) & (places < [columns, rows]), axis=1)]
     reached = np.setdiff1d(floors[places[:, 1], places[:, 0]], [0])
+    if not starts.any():
+        reached = np.array([1 + np.argmax(np.bincount(floors.ravel())[1:])])
     require(
         len(reached) > 0, f"world {world.name}: start pose and way-points lie in walls or outside"
     )

@@ -8,7 +8,7 @@ import numpy as np
 
 from sim.arrays import Array
 from sim.errors import require
-from sim.worlds.floor_plan import Plan, box_corners, check_margins
+from sim.worlds.floor_plan import Plan, box_corners, check_cells, check_margins
 from sim.worlds.world import World
 
 
@@ -24,6 +24,7 @@ def town(
 ) -> World:
     """Build blocks in a grid of streets; the tour is a closed way along the streets."""
     require(n_x >= 1 and n_y >= 1, f"world.n_x and n_y must be at least 1, got {n_x} and {n_y}")
+    check_cells(n_x, n_y)
     check_margins(block_m=block_m - 30.0, street_m=street_m - 6.0)
     plan, pitch = Plan(), block_m + street_m
     corners = [(0, 0), (n_x, 0), (n_x, n_y), (0, n_y), (0, 0)]

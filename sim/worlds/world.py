@@ -1,7 +1,9 @@
 """World: upright walls, point landmarks and named places, in the frame `map` (metres)."""
 
+from __future__ import annotations
+
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -99,6 +101,10 @@ class World:
             ]
         )
         return np.concatenate([points.min(axis=0), points.max(axis=0)])
+
+    def as_map(self) -> World:
+        """Return what a map shows of the world: neither where a robot starts, nor its tour."""
+        return replace(self, start_pose=np.zeros(3), waypoints=np.zeros((0, 2)))
 
     def place_of(self, points_in_world: Array) -> NDArray[np.str_]:
         """Name of the first place that holds each point (N, 2), or an empty string."""

@@ -71,8 +71,8 @@ def digest_of_defaults(options):
 # A default decides results: who changes one says so in CHANGELOG.md, and here.
 DEFAULTS = {
     "DifferentialDrive": "4c424886",
-    "EkfIcp": "9ee61b3a",
-    "EkfIcpPaper": "5fb40063",
+    "EkfIcp": "471fe7e5",
+    "EkfIcpPaper": "54115b9c",
     "EkfSlam": "0be448aa",
     "Encoder": "9c7c1c0b",
     "External": "a594d99f",
@@ -82,7 +82,7 @@ DEFAULTS = {
     "GtsamBatch": "44b30ce1",
     "GtsamIsam2": "96bf5a4b",
     "Gyroscope": "819bc6ea",
-    "IcpOdometry": "ad2ff2e5",
+    "IcpOdometry": "728fb901",
     "KissIcp": "105071ed",
     "Laser": "15ad3451",
     "Lidar3D": "29cea5d0",

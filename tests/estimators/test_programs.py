@@ -438,6 +438,9 @@ def test_the_suite_of_a_cpp_program_runs(tmp_path, monkeypatch):
     source = EXAMPLES / "external_odometry.cpp"
     subprocess.run(["g++", "-o", tmp_path / "external_odometry", source], check=True)
     monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match="add --trust"):
+        run_suite(suite, {"my_odometry": 1}, n_jobs=1)
+    monkeypatch.setenv("ESTIMA_TRUST", "1")
     rows = run_suite(suite, {"my_odometry": 1}, n_jobs=1)
     assert rows["status"].tolist() == ["ok"]
     assert 0.0 < rows["ate_rmse_m"][0] < 1.0

@@ -89,9 +89,10 @@ def test_every_single_value_counts_in_the_checksum():
         kept = array.flat[-1]
         floats = array.dtype.kind == "f"
         array.flat[-1] = np.nextafter(kept, array.dtype.type(9)) if floats else kept + 1
-        assert recording.checksum != before, name
+        assert dataclasses.replace(recording).checksum != before, name
+        array.setflags(write=True)
         array.flat[-1] = kept
-    assert recording.checksum == before
+    assert dataclasses.replace(recording).checksum == before
     assert dataclasses.replace(recording, status="ok").checksum != before
 
 
@@ -398,3 +399,21 @@ def test_a_full_disk_is_reported_in_one_line(tmp_path, monkeypatch):
     with pytest.raises(InputError, match=r"cannot write \(No space left.*free some space"):
         save(small_recording(), tmp_path / "a.npz")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_travel_is_that_of_the_believed_wheels():
+    recording = small_recording()
+    assert recording.with_wheel_radius(recording.robot.wheel_radius_m) is recording
+    larger = recording.with_wheel_radius(2.0 * recording.robot.wheel_radius_m)
+    for ours, theirs in zip(recording.frames(), larger.frames(), strict=True):
+        assert np.allclose(2.0 * ours.wheel_increments_m, theirs.wheel_increments_m)
+
+
+def test_frames_own_their_arrays():
+    recording = small_recording()
+    for frame in recording.frames():
+        for values in (frame.wheel_increments_m, *(v for r in frame.readings.values()
+                                                   for v in r.values())):  # fmt: skip
+            assert isinstance(values.base, bytes)
+            with pytest.raises(ValueError, match="cannot set WRITEABLE"):
+                values.setflags(write=True)

@@ -90,7 +90,7 @@ def dc2(ellipses: pd.DataFrame) -> Iterator[Claim]:
     """DC2: on a bare corridor the ellipse stretches along it, and shrinks near objects."""
     for method, where in _HOW.items():
         table = ellipses[ellipses["method"] == method]
-        ratio, n = mean_interval(table["axis_ratio_bare"]), len(table)
+        ratio = mean_interval(table["axis_ratio_bare"])
         tilt = mean_interval(table["tilt_bare_deg"])
         shrinks = log_ratio_interval(table["long_objects_m"], table["long_bare_m"])
         for quantity, label, found, bounds in (
@@ -99,9 +99,7 @@ def dc2(ellipses: pd.DataFrame) -> Iterator[Claim]:
             ("near objects", "long axis near objects over bare", shrinks, (-np.inf, 0.5)),
         ):
             about = Subject("DC2", quantity, method=method)
-            yield beside(
-                judge_bounds(about, label + where, found, *bounds, n=n), method != "printed"
-            )
+            yield beside(judge_bounds(about, label + where, found, *bounds), method != "printed")
 
 
 def dc3(ellipses: pd.DataFrame) -> Iterator[Claim]:
@@ -111,7 +109,7 @@ def dc3(ellipses: pd.DataFrame) -> Iterator[Claim]:
     """
     for (method, where), bend in itertools.product(_HOW.items(), ("curve", "corner")):
         table = ellipses[ellipses["method"] == method]
-        n, before = len(table), table[f"long_before_{bend}_m"]
+        before = table[f"long_before_{bend}_m"]
         grown, typical, after = (
             log_ratio_interval(table[f"long_{part}_{bend}_m"], before)
             for part in ("in", "median_in", "after")
@@ -125,7 +123,7 @@ def dc3(ellipses: pd.DataFrame) -> Iterator[Claim]:
             ("turn", f"turn of the long axis {turn}", turned, (10.0,)),
         ):
             about = Subject("DC3", quantity, method=method, place=bend)
-            claim = judge_bounds(about, label, found, *bounds, n=n)
+            claim = judge_bounds(about, label, found, *bounds)
             yield beside(claim, is_beside or method != "printed" or quantity in ("median", "turn"))
 
 
@@ -138,7 +136,6 @@ def dc4(covariances: pd.DataFrame) -> Iterator[Claim]:
     to point, matches that slide stand beside.
     """
     nees = nees_intervals(covariances)
-    n = covariances["seed"].nunique()
     for metric in METRICS:
         is_beside = metric != METRICS[0]
         table = covariances[covariances["metric"] == metric]
@@ -149,7 +146,7 @@ def dc4(covariances: pd.DataFrame) -> Iterator[Claim]:
                 found, (low, high) = nees[metric, place, method], CONSISTENT
                 what = f"ANEES over dof of {method}, {metric}, {place}"
                 about = Subject("DC4", "ANEES", method=method, metric=metric, place=place)
-                claim = judge_bounds(about, what, found, low, high, n=n)
+                claim = judge_bounds(about, what, found, low, high)
                 if method.startswith("hessian"):
                     claim = replace(
                         claim,
@@ -195,12 +192,10 @@ def dc5(metrics: pd.DataFrame) -> Iterator[Claim]:
                 ("time", "time_us", 0.8),
             ):
                 pairs = (wide.loc[kind, (column, f"point_to_{to}")] for to in (better, "point"))
-                ratio, n = log_ratio_interval(*pairs), len(wide.loc[kind])
+                ratio = log_ratio_interval(*pairs)
                 label = f"{what}, point to {better} over point to point, {kind}"
                 about = Subject("DC5", what, metric=f"point_to_{better}", place=kind)
-                yield beside(
-                    judge_bounds(about, label, ratio, at_most=at_most, n=n), better == "line"
-                )
+                yield beside(judge_bounds(about, label, ratio, at_most=at_most), better == "line")
 
 
 def dc6(runs: pd.DataFrame) -> list[Claim]:

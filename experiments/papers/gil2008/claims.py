@@ -5,6 +5,7 @@ anything is compared. Errors of position and map are those of the revised path a
 best particle, as the paper has them, raw and rigidly aligned.
 """
 
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -21,20 +22,23 @@ from experiments.evaluation.statistics import (
     page_trend_p,
 )
 from experiments.judging.claim import (
+    SMALLEST_EFFECT,
     Claim,
     Role,
     Subject,
     Verdict,
     beside,
+    effect_in_words,
     holds,
     judge_bounds,
     judge_equivalent,
-    more_by_p,
+    power_of,
     shown,
     with_remark,
 )
 from experiments.judging.results import Results
 from experiments.judging.sentences import percent
+from experiments.judging.sequential import Design, designs, judge_ratio
 from experiments.papers.gil2008.settings import P0
 from sim.arrays import Array
 
@@ -54,6 +58,7 @@ NOISE = {"paper": "noise of 10 px", "pixel": "noise of 1 px"}
 BOUNDED = 0.5  # share of odometry's error below which the error of SLAM counts as bounded
 REVISITS_GROW = 1.25  # error at later visits over that at the first: odometry must be above it
 NOT_WORSE = 1.3  # 10 m against 20 m
+DIVERGE_MORE = 0.2  # share of worlds: the smallest effect of interest
 _DESCRIPTORS = 0.9  # their noise in the headline of GI7
 
 
@@ -63,7 +68,7 @@ def judge(results: Results) -> list[Claim]:
     return [
         *gi1(particles, results.table("laps")),
         *gi2(particles, results.table("bound")),
-        *gi3(particles),
+        *gi3(particles, designs("gil2008")["GI3"]),
         *gi4(distance),
         *gi5(distance),
         *gi6(results.table("observations")),
@@ -103,13 +108,11 @@ def gi1(particles: pd.DataFrame, laps: pd.DataFrame) -> Iterator[Claim]:
             ours, odometry = (
                 pool_by_world(part, c, "filter") for c in (POSITION, "odometry_rmse_m")
             )
-            found[m] = log_ratio_interval(ours[name], odometry[name]), len(ours)
-        m, (worst, n) = max(found.items(), key=lambda item: item[1][0].high)
+            found[m] = log_ratio_interval(ours[name], odometry[name])
+        m, worst = max(found.items(), key=lambda item: item[1].high)
         label = f"error of SLAM over odometry's, the worst of M >= 50: {where}"
         about = Subject("GI1", "over odometry", method=name, noise=noise, size=int(m))
-        claim = judge_bounds(
-            about, label, worst, at_most=BOUNDED, criterion=f"below {BOUNDED:g}", n=n
-        )
+        claim = judge_bounds(about, label, worst, at_most=BOUNDED, criterion=f"below {BOUNDED:g}")
         yield beside(with_remark(claim, f"M = {m}"), is_beside)
     yield from _revisits(laps)
     own = mean_interval(particles.groupby("seed")["odometry_rmse_m"].mean())
@@ -123,14 +126,13 @@ def _revisits(laps: pd.DataFrame) -> Iterator[Claim]:
     criterion = f"below {REVISITS_GROW:g}, where odometry's is above it"
     grows = f"above {REVISITS_GROW:g}: a growing error shows on this course"
     own = _growth(laps.drop_duplicates("seed"), "odometry_revisit_ratio")
-    n = laps["seed"].nunique()
     about, words = Subject("GI1", "revisits", method="odometry"), f"error of odometry {label}"
-    yield beside(judge_bounds(about, words, own, REVISITS_GROW, criterion=grows, n=n))
+    yield beside(judge_bounds(about, words, own, REVISITS_GROW, criterion=grows))
     for (noise, name), table in laps.groupby(["noise", "filter"], sort=False):
         growth, words = _growth(table, "revisit_ratio"), f"{NAMES[name]}, {NOISE[noise]}"
         about, words = Subject("GI1", "revisits", method=name, noise=noise), f"{label}: {words}"
         claim = judge_bounds(
-            about, f"error of SLAM {words}", growth, at_most=REVISITS_GROW, criterion=criterion, n=n
+            about, f"error of SLAM {words}", growth, at_most=REVISITS_GROW, criterion=criterion
         )
         if not own.low > REVISITS_GROW:
             claim = _undecided(claim, "odometry's is not clearly above it on this course")
@@ -153,11 +155,11 @@ def gi2(particles: pd.DataFrame, bound: pd.DataFrame) -> Iterator[Claim]:
             yield shown(replace(about, quantity=f"{what} over bound"), label, found, "ours: 2")
 
 
-def gi3(particles: pd.DataFrame) -> Iterator[Claim]:
+def gi3(particles: pd.DataFrame, design: Design) -> Iterator[Claim]:
     """GI3: nothing significant is gained past 200 particles.
 
-    Judged by equivalence, since few data would make any gain insignificant; whether the gain is
-    significant stands beside.
+    Judged by equivalence, since few data would make any gain insignificant, and by a sequential
+    design; whether the gain is significant stands beside.
     """
     table = particles[(particles["noise"] == "paper") & particles["n_particles"].isin([200, 1000])]
     for name, part in table.groupby("filter", sort=False):
@@ -168,7 +170,14 @@ def gi3(particles: pd.DataFrame) -> Iterator[Claim]:
             is_beside = name != "paper" or column != POSITION
             label, ones = f"{what} error, M = 200 over M = 1000", np.ones(len(values))
             about = Subject("GI3", what, method=name, noise="paper")
-            claim = judge_equivalent(about, f"{label}: {NAMES[name]}", values, ones, 0.25)
+            words, margin = f"{label}: {NAMES[name]}", design.effect
+            claim = (
+                judge_equivalent(about, words, values, ones, margin)
+                if is_beside
+                else judge_ratio(
+                    about, words, (values, ones), design, 1.0 / (1.0 + margin), 1.0 + margin
+                )
+            )
             claim = with_remark(claim, remark, n_recordings=n_recordings, n_worlds=len(values))
             yield beside(claim, is_beside)
             found, about = log_ratio_interval(values, ones), replace(about, arm="significance")
@@ -183,8 +192,8 @@ def gi4(distance: pd.DataFrame) -> Iterator[Claim]:
     for about, words, is_beside, is_ours, part in _kinds("GI4", distance[distance["occluded"]]):
         errors = pool_by_world(part, POSITION, "max_distance_m")
         found = log_ratio_interval(errors[3], errors[10])
-        label, n = f"position error, dmax = 3 m over 10 m: {words}", len(errors)
-        claim = judge_bounds(about, label, found, at_least=1.5, criterion="above 1.5", n=n)
+        label = f"position error, dmax = 3 m over 10 m: {words}"
+        claim = judge_bounds(about, label, found, at_least=1.5, criterion="above 1.5")
         yield shown(about, label, found) if is_ours else beside(claim, is_beside)
 
 
@@ -199,7 +208,7 @@ def gi5(distance: pd.DataFrame) -> Iterator[Claim]:
         found = log_ratio_interval(values, np.ones(len(values)), level=0.90)
         label = f"position error, dmax = 10 m over 20 m (90 % interval): {words}"
         claim = judge_bounds(
-            about, label, found, at_most=NOT_WORSE, criterion="below 1.3", n=len(values)
+            about, label, found, at_most=NOT_WORSE, criterion="below 1.3", level=0.90
         )
         if far < 0.1:
             claim = _undecided(claim, "too few far observations")
@@ -251,9 +260,7 @@ def gi7(association: pd.DataFrame) -> Iterator[Claim]:
         yield beside(_divergence(about, ekf > 0.5, particles > 0.5, where), is_beside)
         label = f"error of EKF-SLAM over FastSLAM's, both by Mahalanobis distance: {where}"
         about = replace(about, quantity="EKF-SLAM over FastSLAM")
-        yield beside(
-            judge_bounds(about, label, log_ratio_interval(ekf, particles), 1.0, n=len(ekf))
-        )
+        yield beside(judge_bounds(about, label, log_ratio_interval(ekf, particles), 1.0))
 
 
 def _divergence(
@@ -268,18 +275,19 @@ def _divergence(
     n = alone + other
     p = float(stats.binomtest(alone, n, alternative="greater").pvalue) if n else 1.0
     label = f"share of runs that diverge, EKF-SLAM less FastSLAM, both by Mahalanobis: {where}"
-    verdict, more = Verdict.UNDECIDED, 0
+    verdict = Verdict.UNDECIDED
     if len(ekf) >= 2 and p < 0.01:
         verdict = Verdict.REPRODUCED
     elif found.high <= 0.0 and n:
         verdict = Verdict.NOT_REPRODUCED
-    elif alone > other:
-        more = more_by_p(len(ekf), p, 0.01)
     shares = f"EKF-SLAM in {percent(ekf.mean())}, FastSLAM in {percent(fastslam.mean())}"
     reason = f"{shares}, with half of odometry's error or more; p = {p:.2g}"
     facts = {"ekf": float(ekf.mean()), "fastslam": float(fastslam.mean()), "p": p}
-    claim = Claim(about, label, found, "above 0, McNemar's p < 0.01", verdict, reason, facts=facts)
-    return replace(claim, more=max(more, 0))
+    power = power_of(found, DIVERGE_MORE, error=0.01)
+    return Claim(
+        about, label, found, "above 0, McNemar's p < 0.01", verdict, reason,
+        effect=f"a share greater by {DIVERGE_MORE:g}", power=power, facts=facts,
+    )  # fmt: skip
 
 
 def gi8(cost: pd.DataFrame) -> Iterator[Claim]:
@@ -292,9 +300,7 @@ def gi8(cost: pd.DataFrame) -> Iterator[Claim]:
         repeats = table.groupby("repeat")
         found = mean_interval([log_log_slope(p["n_landmarks"], p["step_ms"]) for _, p in repeats])
         label = f"exponent of N in the time of a step, {maps} maps, resampling at every image"
-        yield judge_bounds(
-            Subject("GI8", "exponent", arm=maps), label, found, *bands[maps], n=len(repeats)
-        )
+        yield judge_bounds(Subject("GI8", "exponent", arm=maps), label, found, *bands[maps])
     wide = cost.groupby(["n_landmarks", "maps"])["step_ms"].median().unstack("maps")
     for n, ratio in (wide["contiguous"] / wide["shared"]).items():
         label = f"time of a step, contiguous over shared, at N = {n}"
@@ -338,7 +344,7 @@ def _kinds(
 
 
 def _undecided(claim: Claim, reason: str) -> Claim:
-    return replace(claim, verdict=Verdict.UNDECIDED, reason=reason, more=0)
+    return replace(claim, verdict=Verdict.UNDECIDED, reason=reason, power=math.nan)
 
 
 def _trends(
@@ -351,16 +357,17 @@ def _trends(
     for column, what in ERRORS.items():
         errors = pool_by_world(table, column, by)
         (first, *_, last), p, n = errors.columns, page_trend_p(errors), len(errors)
-        verdict, more = Verdict.NOT_REPRODUCED, 0
+        verdict = Verdict.NOT_REPRODUCED
         if p < limit:
             verdict = Verdict.REPRODUCED
         elif p < 0.05 or n < 20:
-            verdict, more = Verdict.UNDECIDED, max(more_by_p(n, p, limit), 0)
+            verdict = Verdict.UNDECIDED
         label = f"{what} error, {symbol} = {last} over {symbol} = {first}: {where}"
         found = log_ratio_interval(errors[last], errors[first])
         criterion, reason = f"Page's p below {limit:g}", f"Page's p = {p:.2g}"
         claim = Claim(
-            replace(about, quantity=what), label, found, criterion, verdict, reason, more=more,
+            replace(about, quantity=what), label, found, criterion, verdict, reason,
+            effect=effect_in_words(SMALLEST_EFFECT), power=power_of(found, error=limit),
             facts={"p": p},
         )  # fmt: skip
         yield beside(claim, what.startswith("aligned"))

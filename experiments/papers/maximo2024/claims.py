@@ -192,11 +192,8 @@ def mx2(particles: pd.DataFrame, times: pd.DataFrame) -> Iterator[Claim]:
             n: judge_equivalent(about, label, errors[n], errors[4], 0.05) for n in errors if n != 4
         }
         worst = max(each, key=lambda n: abs(math.log(each[n].found.value)))
-        verdict, more = (
-            overall([c.verdict for c in each.values()]),
-            max(c.more for c in each.values()),
-        )
-        claim = replace(each[worst], verdict=verdict, more=more)
+        verdict = overall([c.verdict for c in each.values()])
+        claim = replace(each[worst], verdict=verdict, power=min(c.power for c in each.values()))
         claim = with_remark(claim, f"{worst} particles a node")
         yield beside(claim, name not in headlines(particles["geometry"]))
     for name, part in times.groupby("geometry", sort=False):
@@ -254,7 +251,7 @@ def _share(
     criterion: str = "",
 ) -> Claim:
     found = share_interval(int(hits.sum()), len(hits))
-    return judge_bounds(about, label, found, at_least, at_most, criterion=criterion, n=len(hits))
+    return judge_bounds(about, label, found, at_least, at_most, criterion=criterion)
 
 
 def mx4(starts: pd.DataFrame) -> Iterator[Claim]:
@@ -281,8 +278,8 @@ def mx5(clusters: pd.DataFrame) -> Iterator[Claim]:
         place = NAMES[name] if descriptor == "synthetic" else f"{NAMES[name]}, {descriptor}"
         about = Subject("MX5", "contiguous", method=descriptor, place=place)
         label = f"share of nodes with a route neighbour in their cluster, {place}"
-        found, n = mean_interval(part), len(part)
-        claim = judge_bounds(about, label, found, at_least=0.8, criterion="above 0.8", n=n)
+        found = mean_interval(part)
+        claim = judge_bounds(about, label, found, at_least=0.8, criterion="above 0.8")
         yield beside(claim, name not in decisive)
 
 
@@ -298,7 +295,7 @@ def mx7(starts: pd.DataFrame) -> Claim:
     worlds = starts.dropna(subset="rms_m").groupby("seed")[["spacing_m", "rms_m"]].mean()
     ratio = log_ratio_interval(worlds["spacing_m"], worlds["rms_m"])
     label = "node spacing over RMS error with refinement, campus clouds (our own)"
-    return judge_bounds(Subject("MX7", "spacing"), label, ratio, at_least=5.0, n=len(worlds))
+    return judge_bounds(Subject("MX7", "spacing"), label, ratio, at_least=5.0)
 
 
 def mx8(kidnapping: pd.DataFrame) -> Iterator[Claim]:

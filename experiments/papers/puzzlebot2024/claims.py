@@ -11,6 +11,7 @@ import pandas as pd
 
 from experiments.evaluation.statistics import Interval, mean_interval, share_interval
 from experiments.judging.claim import (
+    EQUIVALENCE,
     Claim,
     Role,
     Subject,
@@ -19,8 +20,8 @@ from experiments.judging.claim import (
     holds,
     judge_bounds,
     judge_interval,
-    more_to_settle,
     overall,
+    power_of,
     shown,
 )
 from experiments.judging.results import Results
@@ -93,7 +94,7 @@ def pb2(areas: pd.DataFrame, crossover: pd.DataFrame, track_m: float) -> Iterato
             yield Claim(about, statistic, found, "0", holds(shrinking <= 0.0))
     ratio = mean_interval(crossover["crossover_m"] / (track_m * math.sqrt(3.0) / 2.0))
     statistic = "distance at which heading-borne spread overtakes, over track sqrt(3) / 2"
-    yield judge_bounds(Subject("PB2", "crossover"), statistic, ratio, 0.98, 1.02, n=len(crossover))
+    yield judge_bounds(Subject("PB2", "crossover"), statistic, ratio, 0.98, 1.02)
 
 
 def pb3(
@@ -115,21 +116,18 @@ def pb3(
         slips, parts = table[is_slip], {"kr and kl": table[is_slip]}
         if joint:
             parts["gains and track"] = table[~is_slip]
-        n = table["seed"].nunique()
         for names, part in parts.items():
             share = _clustered_share(part["truth"].between(part["low"], part["high"]), part["seed"])
             label = f"coverage of the 95 % intervals of {names}: {where}"
             covered = dataclasses.replace(about, quantity="coverage", metric=names)
-            claim = judge_bounds(covered, label, share, 0.90, 0.99, n=n)
+            claim = judge_bounds(covered, label, share, 0.90, 0.99)
             yield beside(claim, is_beside or names != "kr and kl")
         relative = slips["value"] / slips["truth"] - 1.0
         biases = [mean_interval(part) for _, part in relative.groupby(slips["parameter"])]
         worse = max(biases, key=lambda bias: abs(bias.value))
         label = f"relative bias, the worse of kr and kl: {where}"
         verdict = overall([judge_interval(bias, -0.05, 0.05) for bias in biases])
-        claim = dataclasses.replace(
-            judge_bounds(about, label, worse, -0.05, 0.05, n=n), verdict=verdict
-        )
+        claim = dataclasses.replace(judge_bounds(about, label, worse, -0.05, 0.05), verdict=verdict)
         yield beside(claim, is_beside)
     for row in engine_k.itertuples():
         label = (
@@ -179,11 +177,10 @@ def pb4(coverage: pd.DataFrame, engine: pd.DataFrame, cases: pd.DataFrame) -> It
     length_m = straights["v_mps"] * straights["duration_s"]
     left = []
     for k, table in coverage.groupby("k_m"):
-        runs = [int(n) for n in table["runs"]]
         shares = [share_interval(int(row.in_ellipse), int(row.runs)) for row in table.itertuples()]
         worst = int(np.argmin([share.value for share in shares]))
         parts = [judge_interval(share, *_BAND) for share in shares]
-        more = [more_to_settle(share, n, *_BAND) for share, n in zip(shares, runs, strict=True)]
+        powers = [power_of(share, band=_BAND) for share in shares]
         case = table.iloc[worst]["case"]
         n_within = f"{parts.count(Verdict.REPRODUCED)} of {len(parts)}"
         claim = Claim(
@@ -193,7 +190,8 @@ def pb4(coverage: pd.DataFrame, engine: pd.DataFrame, cases: pd.DataFrame) -> It
             "every manoeuvre's interval within 0.93 and 0.97",
             overall(parts),
             f"{n_within} manoeuvres within; the least in {case}",
-            more=max(more),
+            effect=EQUIVALENCE,
+            power=min(powers),
             facts={"case": case, "straight_m": length_m.get(case), "band": _BAND},
         )
         yield beside(claim, k > HELD_UP_TO_M * (1 + 1e-9))

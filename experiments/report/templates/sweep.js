@@ -100,6 +100,15 @@ function draw() {
   });
 }
 
+// The intervals of a sweep that ran until it was decided, in the colours and type of the other chart.
+let drawnNarrowing;
+function drawNarrowing() {
+  if (!data.narrowing) return;
+  const spec = { ...structuredClone(data.narrowing), config: data.spec.config };
+  spec.spec.width = Math.max(120, byId("narrowing").parentElement.clientWidth - 110);
+  drawnNarrowing = vegaEmbed("#narrowing", spec, { ast: true, renderer: "svg", actions: false });
+}
+
 // What a click on a run's dot offers: its picture, or the command that draws it.
 function pick({ row, runs = 1 }) {
   if (row === undefined || runs > 1) return;
@@ -107,7 +116,7 @@ function pick({ row, runs = 1 }) {
   const picture = data.pictures[key];
   const made = document.createElement(picture ? "a" : "code");
   if (picture) made.href = picture;
-  made.textContent = picture ? "watch" : `estima view ${data.name}/${key}${data.options} -o run.html`;
+  made.textContent = picture ? "watch" : `estima view ${data.called}/${key}${data.options} -o run.html`;
   byId("picked").replaceChildren(`${named(row).map((pair) => pair.join(": ")).join(", ")}. `, made, " ");
   if (picture) return;
   const copy = document.createElement("button");
@@ -138,7 +147,9 @@ function showExtremes() {
 }
 
 draw();
+drawNarrowing();
 byId("chosen").addEventListener("change", draw);
 addEventListener("resize", draw);
+addEventListener("resize", drawNarrowing);
 byId("of").addEventListener("change", showExtremes);
 document.addEventListener("click", copied);

@@ -49,7 +49,7 @@ def gi10(runs: pd.DataFrame) -> Iterator[Claim]:
         yield shown(*subject(seen, shared, own), log_ratio_interval(area[shared], area[own]))
     ratio = log_ratio_interval(chart[JUDGED], chart[BASE])
     about = subject("error of FastSLAM's map", JUDGED, BASE)
-    yield judge_bounds(*about, ratio, at_most=MARGIN, n=len(chart))
+    yield judge_bounds(*about, ratio, at_most=MARGIN)
     by_strategy = runs.groupby("strategy")
     n_robots, stopped = N_ROBOTS * by_strategy["seed"].count(), by_strategy["stopped"].sum()
     for strategy in (BASE, JUDGED):

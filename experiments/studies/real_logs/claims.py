@@ -9,6 +9,7 @@ import pandas as pd
 
 from experiments.evaluation.statistics import Interval
 from experiments.judging.claim import (
+    SMALLEST_EFFECT,
     Claim,
     Subject,
     Verdict,
@@ -74,9 +75,9 @@ def _difference(about: Subject, fused: pd.Series[float], rival: pd.Series[float]
         f"translational error of {FUSION} less that of the other, m: {about.over}, Intel, "
         f"{about.place}"
     )
-    minutes = int(rival["difference_minutes"])
-    claim = judge_bounds(about, label, found, at_most=0.0, criterion="below 0", n=minutes)
     ours_m, other_m = float(fused.translation_mean_m), float(rival.translation_mean_m)
+    effect_m = SMALLEST_EFFECT * other_m
+    claim = judge_bounds(about, label, found, at_most=0.0, criterion="below 0", effect=effect_m)
     remark = f"fusion {ours_m:.3f} m, the other {other_m:.3f} m"
     return with_remark(claim, remark, fused_m=ours_m, other_m=other_m)
 

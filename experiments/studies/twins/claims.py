@@ -9,7 +9,7 @@ from scipy import stats
 from experiments.evaluation.statistics import Interval, mean_interval, share_interval
 from experiments.judging.claim import Claim, Subject, holds, judge_bounds, shown
 from experiments.judging.results import Results
-from experiments.studies.twins.settings import LEAST_SHARE, SHOWN
+from experiments.studies.twins.settings import LEAST_SHARE, SHOWN, TAU
 
 
 def judge(results: Results) -> list[Claim]:
@@ -73,7 +73,7 @@ def tw2(pairs: pd.DataFrame) -> Iterator[Claim]:
         Interval(mean.value, float(low), float(high)),
         at_least=1e-9,
         criterion="above 0",
-        n=len(judged),
+        effect=TAU,
     )
     for log, tau in taus.items():
         about = Subject("TW2", "tau", place=str(log))

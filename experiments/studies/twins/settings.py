@@ -22,5 +22,6 @@ METHODS = {  # of conf/study/twins/KIND.yaml, in its order
 }
 FIRST_SEED = 1000
 RUNS = {Profile.QUICK: 4, Profile.FULL: 50}
+TAU = 0.3  # the smallest effect of interest
 LEAST_SHARE = 17.0 / 20.0  # of the pairs of log and estimator
 WIDEST, WIDEST_OTHERS = {"dead reckoning": 12.0}, 4.0  # ends of an interval, as a ratio

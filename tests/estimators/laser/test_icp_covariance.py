@@ -1,10 +1,13 @@
 """Covariances of registration against repeated registrations and finite differences."""
 
+from typing import get_args
+
 import numpy as np
 import pytest
+from scipy.spatial import KDTree
 
 from estimators.laser import icp_covariance
-from estimators.laser.icp import prepare, register
+from estimators.laser.icp import DEFAULT_RULES, Plane, Rules, prepare, register
 from estimators.laser.icp_covariance import UNKNOWN_M, UNKNOWN_RAD
 from experiments.bench.icp import BEARINGS_RAD, SIGMA_RANGE_M, pair
 from experiments.evaluation.scan_bound import cast
@@ -21,10 +24,10 @@ def rng():
     return np.random.default_rng(12)
 
 
-def registered(walls, motion, rng, metric="point_to_line", at=AT):
+def registered(walls, motion, rng, metric="point_to_line", at=AT, rules=DEFAULT_RULES):
     target = scan(walls, at, rng)
     source = scan(walls, se2.compose(at, motion), rng)
-    return register(source, target, motion, metric=metric), source, target
+    return register(source, target, motion, metric=metric, rules=rules), source, target
 
 
 def gradient_of(found, target):
@@ -97,18 +100,22 @@ def test_derivatives(metric, rng):
     np.testing.assert_allclose(by_target, expected, rtol=1e-4, atol=1e-5 * by_target.max())
 
 
-def test_derivatives_of_point_to_plane(rng):
+@pytest.mark.parametrize("plane", get_args(Plane))
+def test_derivatives_of_point_to_plane(plane, rng):
     """By finite differences of the gradient, with matches, weights and normals held."""
-    found, source, target = registered(ROOM, [0.05, 0.02, 0.03], rng, "point_to_plane")
+    rules = Rules(plane=plane)
+    found, source, target = registered(ROOM, [0.05, 0.02, 0.03], rng, "point_to_plane", rules=rules)
     A, by_source, by_target = icp_covariance._censi_planes(found, source, target)
     kept, step = found.inliers, 1e-6
     matches, weights = found.matches[kept], found.weights[kept]
-    normals, offsets = (part[matches] for part in found.planes[:2])
+    normals = found.planes.normals[matches]
+    near = KDTree(target.points).query(target.points, k=6)[1][matches]
+    members = near if plane == "centroid" else matches[:, None]
 
     def gradient(pose, source_m, target_m):
         q = se2.transform([0.0, 0.0, pose[2]], source_m[kept, None] * source.rays[kept])
-        moved = (target_m - target.ranges_m)[:, None] * target.rays
-        off = np.sum(normals * (q + pose[:2] - moved[matches]), axis=1) - offsets
+        through = (target_m[:, None] * target.rays)[members].mean(axis=1)
+        off = np.sum(normals * (q + pose[:2] - through), axis=1)
         lever = normals[:, 1] * q[:, 0] - normals[:, 0] * q[:, 1]
         return np.column_stack([normals, lever]).T @ (weights * off)
 

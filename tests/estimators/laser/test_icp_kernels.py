@@ -298,18 +298,29 @@ def test_points_agree_are_denied_or_cannot_be_judged(full_circle):
     assert min(np.trace(denied), np.trace(agreed)) > 10.0
 
 
-def test_planes_are_those_of_the_nearest_neighbours(scans):
+@pytest.mark.parametrize("through_centroid", [False, True])
+def test_planes_have_the_normals_of_the_nearest_neighbours(scans, through_centroid):
     points = scans[0].points
-    normals, offsets = icp_start.planes_of(points, 6)
-    near = points[KDTree(points).query(points, k=6)[1]]
+    planes = icp_start.planes_of(points, 6, through_centroid=through_centroid)
+    near = KDTree(points).query(points, k=6)[1]
     share = 0
     for row, own in enumerate(near):
-        centre = own.mean(axis=0)
-        normal = np.linalg.svd(own - centre)[2][1]
-        if abs(normal @ normals[row]) > 1.0 - 1e-9:
+        normal = np.linalg.svd(points[own] - points[own].mean(axis=0))[2][1]
+        if abs(normal @ planes.normals[row]) > 1.0 - 1e-9:
             share += 1
-            assert offsets[row] == pytest.approx(normals[row] @ centre)
+            members = own if through_centroid else [row]
+            assert sorted(planes.members[row]) == sorted(members)
+            at = points[members].mean(axis=0)
+            assert planes.distances_m[row] == pytest.approx(planes.normals[row] @ at)
     assert share > 0.9 * len(points)  # at jumps of range neighbours may lie beyond the beams beside
+
+
+def test_a_scan_of_fewer_points_than_neighbours_has_planes():
+    points = np.array([[1.0, 0.0], [1.0, 0.1], [1.0, 0.2]])
+    for through_centroid in (False, True):
+        planes = icp_start.planes_of(points, 6, through_centroid=through_centroid)
+        np.testing.assert_allclose(np.abs(planes.normals), [[1.0, 0.0]] * 3, atol=1e-12)
+        np.testing.assert_allclose(np.abs(planes.distances_m), 1.0)
 
 
 def test_trimming_leaves_out_the_farthest():

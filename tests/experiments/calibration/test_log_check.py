@@ -6,6 +6,7 @@ import re
 import numpy as np
 import pytest
 
+from experiments.calibration import log_check
 from experiments.calibration.log_check import check_log
 from sim.recording import Truth
 from tests.experiments.calibration.test_from_log import log_of
@@ -52,3 +53,12 @@ def test_clocks():
     assert "truth: 1 gap, the longest 8.0" in text
     assert "wheels: stamps are whole steps of 0.01 s" in text
     assert "truth: stamps are whole steps" not in text
+
+
+@pytest.mark.parametrize("begin_s", [0.0, 1_700_000_000.0])
+def test_unix_time_is_no_coarse_clock(begin_s):
+    fine = begin_s + 0.0371931 * np.arange(200)
+    assert log_check._clock("wheels", fine) == []
+    assert "whole steps of 0.1 s" in log_check._clock("wheels", begin_s + 0.3 * np.arange(200))[0]
+    coarse = begin_s + np.round(fine - begin_s, 2)
+    assert "whole steps of 0.01 s" in log_check._clock("wheels", coarse)[0]

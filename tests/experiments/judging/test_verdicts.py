@@ -2,13 +2,15 @@
 
 import csv
 import dataclasses
+import math
 import re
 
+import numpy as np
 import pandas as pd
 import pytest
 from jinja2 import UndefinedError
 
-from experiments.evaluation.statistics import Interval, mean_interval
+from experiments.evaluation.statistics import Interval, log_ratio_interval, mean_interval
 from experiments.judging.claim import (
     Claim,
     Role,
@@ -17,7 +19,8 @@ from experiments.judging.claim import (
     beside,
     headline_verdict,
     judge_bounds,
-    more_to_settle,
+    judge_interval,
+    power_of,
     select,
     select_all,
     shown,
@@ -50,7 +53,7 @@ BAD = judge_bounds(
     dataclasses.replace(ABOUT, size=4), "another", Interval(2.0, 1.9, 2.1), 0.8, 1.25
 )
 FUSED = dataclasses.replace(ABOUT, method="fusion")
-OPEN = judge_bounds(FUSED, "a third", Interval(1.2, 1.1, 1.3), 0.8, 1.25, n=20)
+OPEN = judge_bounds(FUSED, "a third", Interval(1.2, 1.1, 1.3), 0.8, 1.25)
 
 
 def verdict_of(*claims):
@@ -75,38 +78,32 @@ def test_what_is_only_shown_stands_beside():
     assert beside(GOOD, False) is GOOD
 
 
-def test_an_undecided_sentence_says_how_many_more_recordings_settle_it():
-    assert verdict_of(GOOD, OPEN).sentence == (
-        "There are 2 rows. About 57 more recordings would settle it."
-    )
-    one = dataclasses.replace(OPEN, more=1)
-    assert verdict_of(one).sentence.endswith("About 1 more recording would settle it.")
+def test_an_undecided_sentence_states_the_power_of_its_size():
     assert verdict_of(GOOD).sentence == "There are 1 rows."
-    unknown = dataclasses.replace(OPEN, more=0)
+    assert verdict_of(GOOD, OPEN).sentence == (
+        "There are 2 rows. Data of this size show equivalence, if there is no difference, with a "
+        "power of 0.99."
+    )
+    low = judge_bounds(FUSED, "a ratio", Interval(1.05, 0.95, 1.16), at_most=1.1)
+    assert verdict_of(OPEN, low).sentence.endswith("decide an effect of 10 % with a power of 0.46.")
+    unknown = dataclasses.replace(OPEN, power=math.nan)
     assert verdict_of(unknown).sentence == "There are 1 rows."
-    assert "would settle what is open." in verdict_of(OPEN, unknown).sentence
-    assert "57 more" in verdict_of(OPEN, dataclasses.replace(beside(OPEN), more=900)).sentence
+    assert "power of 0.99" in verdict_of(OPEN, beside(low), unknown).sentence
 
 
-def test_an_interval_shrinks_with_the_square_root_of_the_recordings():
-    wide = Interval(1.0, -1.0, 3.0)
-    assert more_to_settle(wide, 10, at_most=2.0) == 30
-    assert more_to_settle(wide, 10, at_least=0.0, at_most=2.0) == 30
-    outside = Interval(3.0, -1.0, 7.0)  # that it is outside takes the limit beside it alone
-    assert more_to_settle(outside, 10, at_least=-0.5, at_most=1.0) == 30
-    assert more_to_settle(Interval(3.0, 2.5, 3.5), 10, at_most=2.0) == 0
-    assert more_to_settle(wide, 0, at_most=2.0) == 0
-    assert more_to_settle(mean_interval([1.0]), 1, at_most=2.0) == 0
-    ratio = Interval(2.0, 0.5, 8.0)  # in logs, 4 is half of the way to 8
-    assert more_to_settle(ratio, 10, at_most=4.0) == 30
-
-
-def test_as_many_more_recordings_do_settle_it():
-    small = mean_interval([0.1, 0.9] * 5)
-    more = more_to_settle(small, 10, at_most=0.7)
-    assert more > 0
-    large = mean_interval([0.1, 0.9] * ((10 + more) // 2 + 1))
-    assert large.high < 0.7 < small.high
+def test_the_power_of_a_size_is_that_of_tests_of_its_size():
+    """Shares of drawn samples that are decided, beside the power read from one interval."""
+    rng = np.random.default_rng(0)
+    for shift, band in ((math.log(1.1), (-math.inf, 1.0)), (0.0, (0.8, 1.25))):
+        draws = np.exp(rng.normal(-shift, 0.3, size=(1000, 60)))
+        found = [log_ratio_interval(ratios, np.ones(60)) for ratios in draws]
+        decided = np.mean([judge_interval(each, *band) == "reproduced" for each in found])
+        power = np.mean([power_of(each, band=band) for each in found[:50]])
+        assert power == pytest.approx(decided, abs=0.05)
+    assert math.isnan(power_of(mean_interval([1.0])))
+    assert power_of(Interval(0.0, -0.1, 0.1), effect=0.1, band=(-math.inf, 0.0)) == (
+        pytest.approx(0.5)
+    )
 
 
 def test_numbers_in_sentences():
@@ -212,7 +209,7 @@ def test_every_claim_has_one_verdict_and_a_plain_sentence(tracked):
         assert "nan" not in each.sentence
         assert not re.search(r"unknown times|unknown share|\de\+\d", each.sentence)
         if each.verdict is Verdict.UNDECIDED:
-            assert re.search(r"more \w+( of log)? would|too short", each.sentence)
+            assert re.search(r"with a power of 0\.\d\d\.", each.sentence)
 
 
 def test_criteria_hold_the_rule_and_nothing_that_came_out(tracked):

@@ -13,6 +13,7 @@ from estimators.landmarks.fastslam import FastSLAM
 from experiments.gate.conform import walk
 from experiments.judging.claim import Role, Verdict, select, select_all
 from experiments.judging.results import Profile
+from experiments.judging.sequential import designs
 from experiments.papers.gil2008 import claims as judge
 from experiments.papers.gil2008 import recordings, scores, settings, study
 from experiments.runs.experiment import Experiment
@@ -22,6 +23,7 @@ from tests.fixtures.fakes import circle, tracking_prior, true_ids
 
 K_M = 5e-5
 SEEDS = range(1000, 1020)
+GI3 = designs("gil2008")["GI3"]
 PARTICLES = (10, 50, 100, 200, 300, 500, 1000)
 
 
@@ -312,8 +314,8 @@ def test_gi2_and_gi3_tell_a_trend_from_none():
     assert set(verdicts(judge.gi2(falling, bound))) == {"reproduced"}
     assert len(headlines(judge.gi2(falling, bound))) == 2
     assert "reproduced" not in verdicts(judge.gi2(flat, bound))
-    assert headlines(judge.gi3(flat)) == ["reproduced"]
-    assert headlines(judge.gi3(falling)) == ["not_reproduced"]
+    assert headlines(judge.gi3(flat, GI3)) == ["reproduced"]
+    assert headlines(judge.gi3(falling, GI3)) == ["not_reproduced"]
     shown = select_all(list(judge.gi2(falling, bound)), quantity="position over bound")
     assert shown[0].found.value == pytest.approx(500**-0.4 / 0.1, rel=0.1)
     assert concluded("gil2008", judge.gi2(flat, bound)).verdict != "reproduced"
@@ -322,16 +324,16 @@ def test_gi2_and_gi3_tell_a_trend_from_none():
 def test_gi3_states_equivalence_and_significance_apart():
     """A gain of 10 % is significant, and within 25 %; noisy recordings decide neither."""
     some = sweep("n_particles", (200, 1000), lambda m: 1.1 if m == 200 else 1.0, filter="paper")
-    same, plainly = list(judge.gi3(some))[:2]
+    same, plainly = list(judge.gi3(some, GI3))[:2]
     assert (same.verdict, plainly.verdict) == ("reproduced", "not_reproduced")
     assert (same.role, plainly.role) == ("headline", "beside")
     said = concluded("gil2008", [same, plainly]).sentence
     assert "the gain is significant, and it is within 25 %" in said
     noise = np.exp(np.random.default_rng(1).standard_normal(len(some)))
     wide = some.assign(revised_ate_rmse_m=some["revised_ate_rmse_m"] * noise)
-    same, plainly = list(judge.gi3(wide))[:2]
+    same, plainly = list(judge.gi3(wide, GI3))[:2]
     assert (same.verdict, plainly.verdict) == ("undecided", "reproduced")
-    assert same.more > 0
+    assert same.power < 0.1
 
 
 def test_ratios_are_taken_within_a_recording():
@@ -432,7 +434,7 @@ def test_gi7_counts_the_worlds_in_which_one_filter_alone_diverges():
     few, enough = (list(judge.gi7(associated(diverging=n)))[1] for n in (4, 8))
     assert (few.verdict, enough.verdict) == ("undecided", "reproduced")
     assert few.reason.endswith("p = 0.062")
-    assert few.more > 0
+    assert 0.0 < few.power < 1.0
     both = list(judge.gi7(associated(fastslam=2.5)))[1]
     assert both.verdict == "undecided"
 

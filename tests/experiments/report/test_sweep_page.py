@@ -83,6 +83,28 @@ def test_a_sweep_without_a_sound_run_says_why_and_proposes_what_works(
         of_sweep.plot_of(table, "mine", panels, tmp_path)
 
 
+def test_the_intervals_of_a_decided_sweep_are_drawn_as_they_narrow(tmp_path, chromium):
+    looks = [(12, 0.8, 3.2, "open"), (20, 1.2, 2.4, "lost")]
+    rows_ = [
+        {"seeds": n, "over_recordings": EVIL, "arm": "b", "against": "a", "value": 1.7,
+         "low": low, "high": high, "found": found}
+        for n, low, high, found in looks
+    ]  # fmt: skip
+    record = {"metric": "answer_ate_rmse_m", "margin": 0.1, "looks": [12, 20, 40], "made": 40,
+              "total": 80, "comparisons": rows_}  # fmt: skip
+    (tmp_path / "decided.json").write_text(json.dumps(record))
+    write_sweep_page(rows(), "mine", tmp_path, tmp_path / "page.html")
+    assert "b loses to a (1.7 [1.2, 2.4])" in (tmp_path / "page.html").read_text()
+    chromium.open((tmp_path / "page.html").as_uri())
+    assert chromium.js("drawnNarrowing.then(() => byId('narrowing').innerText)").count("b over a")
+    lengths = chromium.js(
+        "[...document.querySelectorAll('#narrowing .role-mark line[stroke=\"#0072B2\"]')]"
+        ".map((l) => Math.abs(l.getAttribute('y2')))"
+    )
+    assert len(lengths) == 2
+    assert lengths[0] / lengths[1] == pytest.approx(np.log(3.2 / 0.8) / np.log(2.4 / 1.2), rel=0.02)
+
+
 def test_a_page_too_large_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(sweep_page, "MOST_RUNS", 10)
     with pytest.raises(InputError, match=r"54 runs; a page holds 10.*condition"):

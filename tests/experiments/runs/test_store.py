@@ -126,6 +126,54 @@ def test_a_run_that_did_not_fail_is_kept_else_the_last(tmp_path):
     assert over.failed == {3: "died: second"}
 
 
+def test_half_a_character_costs_nothing(tmp_path):
+    """A program, a file's name or an exception may hold one; UTF-8 cannot."""
+    status = Status.of_error(ValueError("\ud800 bad\nthing")).columns()
+    assert status["status_detail"] == "? bad thing"
+    with store.journal(tmp_path / "rows-a.journal") as journal:
+        journal.append([row(1, **status)])
+        journal.append([row(2, **{"status_detail": "\udfff", "a\ud800": "b\ud800"})])
+    assert store.ended(tmp_path).failed == {1: "ValueError: ? bad thing"}
+    store.compact(tmp_path / "rows-a.journal")
+    table = store.read_runs(tmp_path).set_index("seed")
+    assert table.loc[2, "status_detail"] == "?"
+    assert table.loc[2, "a?"] == "b?"
+    store.write_run([row(3, x="\ud800")], tmp_path)
+
+
+class UnreadableError(Exception):
+    def __str__(self):
+        raise RuntimeError
+
+
+def test_an_exception_without_words_is_a_status():
+    assert Status.of_error(UnreadableError()).detail == "its message cannot be read"
+
+
+WRONG = {
+    "run_key": ["../../x", "", None, "a b", "x" * 65],
+    "status": ["odd", "", None, "OK"],
+    "repeat": [None, float("nan"), 0.5],
+}
+
+
+@pytest.mark.parametrize(("column", "value"), [(c, v) for c in WRONG for v in WRONG[c]])
+def test_a_row_that_is_none_is_refused_wherever_it_is_read_or_written(tmp_path, column, value):
+    bad = {**row(1), column: value}
+    pd.DataFrame([bad, row(2)]).to_parquet(tmp_path / "rows-a.parquet")
+    for read in (store.read_runs, store.ended)[: 1 + (column != "repeat")]:
+        with pytest.raises(InputError, match=rf"column {column} holds \[.*; delete the file"):
+            read(tmp_path)
+    pd.DataFrame([bad, row(2)]).to_csv(tmp_path / "rows.csv", index=False)
+    with pytest.raises(InputError, match=rf"column {column} holds"):
+        store.read_runs(tmp_path / "rows.csv")
+    with pytest.raises(InputError, match=column):
+        store.write_run([bad], tmp_path / "out")
+    with store.journal(tmp_path / "rows-b.journal") as journal:
+        journal.append([bad])
+    assert not list(store.journal_lines((tmp_path / "rows-b.journal").read_bytes()))
+
+
 def test_a_single_run_replaces_its_rows(tmp_path):
     for value in (1.0, 2.0):
         path = store.write_run([row(7, x=value)], tmp_path)

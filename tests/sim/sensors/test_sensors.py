@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 
+from experiments.runs.experiment import Experiment
 from sim.errors import InputError
 from sim.sensors import (
     Encoder,
@@ -8,6 +9,8 @@ from sim.sensors import (
     Laser,
     Lidar3D,
     PlaceDescriptor,
+    RealCamera,
+    RealLaser,
     RobotCamera,
     StereoCamera,
     sensor_of,
@@ -169,3 +172,31 @@ def test_settings_make_the_same_sensor(sensor):
 def test_what_is_only_recorded_cannot_be_simulated():
     with pytest.raises(InputError, match="choose sensors=lidar3d"):
         PlaceDescriptor().start(np.random.default_rng(0))
+
+
+@pytest.mark.parametrize("kind", [Laser, Lidar3D, RealLaser])
+def test_ranges_that_end_before_they_begin_are_refused(kind):
+    with pytest.raises(InputError, match=r"min_range_m must be below max_range_m.* got 5 and 5"):
+        kind(min_range_m=5.0, max_range_m=5.0)
+    assert kind(min_range_m=4.9, max_range_m=5.0).max_range_m == 5.0
+
+
+@pytest.mark.parametrize("selection", ["nearest", "random", "spread"])
+def test_a_real_camera_keeps_to_its_most_observations(selection):
+    experiment = Experiment.compose(
+        ["world=rooms", "sensors=real_camera", "route.distance_m=3", "simulation.physics=kinematic",
+         "sensors.stereo.detection_share=1.0", f"sensors.stereo.selection={selection}"]
+    )  # fmt: skip
+    free = np.diff(experiment.simulate().log("stereo").known_splits)
+    most = experiment.with_leaves([(("sensors", "stereo", "max_observations"), 2)])
+    log = most.simulate().log("stereo")
+    assert free.max() > 2
+    assert np.array_equal(np.diff(log.known_splits), np.minimum(free, 2))
+    if selection == "nearest":
+        depths = np.linalg.norm(log["points_in_camera"], axis=1).reshape(-1)
+        assert (
+            depths.mean()
+            < np.linalg.norm(experiment.simulate().log("stereo")["points_in_camera"], axis=1).mean()
+        )
+    with pytest.raises(InputError, match="no effect on a RealCamera"):
+        RealCamera(sigma_view_descriptor=0.1)
