@@ -1,4 +1,4 @@
-"""Pages of the documentation that are made from the code: a hook of mkdocs (`hooks:` in mkdocs.yml).
+"""Pages of the documentation that are made from the code, by a hook of mkdocs (mkdocs.yml).
 
 Commands, configuration keys, estimators, metrics and the gallery of figures. The pages exist only
 while mkdocs builds the site, so nothing in them is written twice.
@@ -146,9 +146,9 @@ def _keys(kind: Any, stated: Mapping[str, Any], prefix: str) -> Iterator[str]:
 
 def _metrics() -> Iterator[str]:
     yield (
-        "# Metrics\n\nColumns of a row, in the words that tables and plots use. Online columns have "
-        "no prefix; `revised_` is the path from `finish`, and `answer_` the better of what a method "
-        "has: revised if it revises, else online.\n"
+        "# Metrics\n\nColumns of a row, in the words that tables and plots use. Those of the "
+        "online path have no prefix, those of the path from `finish` have `revised_`. `answer_` is "
+        "the path by which a method is ranked: revised if it has one, else online.\n"
     )
     rows = [
         (f"`{name}`", column.label, column.unit, column.better or "")
@@ -246,8 +246,8 @@ def _gallery() -> Iterator[str]:
             yield "```text\n" + "\n".join(commands) + "\n```\n"
             for name, figure in page["figures"].items():
                 if (ROOT / "results" / "figures" / f"{name}.png").exists():
-                    yield f"### {figure['title']}\n\n![{_cell(figure['alt'])}](gallery/{name}.png)\n"
-                    yield f"{' '.join(figure['alt'].split())}\n"
+                    said = " ".join(figure["alt"].split())
+                    yield f"### {figure['title']}\n\n![{said}](gallery/{name}.png)\n\n{said}\n"
 
 
 # Markdown

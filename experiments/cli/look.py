@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import Annotated
 
@@ -118,9 +119,14 @@ def recommend(
 
       estima recommend sensors=hokuyo prior.map=world world=office
     """
-    from experiments.report.recommend import recommend
+    from experiments.report.recommend import SURE, recommend
 
-    show(recommend(overrides or []))
+    advice = recommend(overrides or [])
+    show(
+        f"{advice.text}\n\nTo be sure, run the best in your own setting:\n"
+        f"  {shlex.join(['estima', 'run', '-m', *advice.sweep])}\n"
+        f"  estima table {SURE} --times"
+    )
 
 
 def view(

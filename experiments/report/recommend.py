@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import math
-import shlex
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pandas as pd
 
@@ -26,6 +25,7 @@ _ERROR = "answer_ate_rmse_m"
 _ALWAYS = ("world", "robot.kr", "robot.kl", "route.distance_m")  # compared for every estimator
 _MOST_CHANGES, _MOST_SHOWN, _MOST_TRIED = 6, 8, 4
 _TUNED = "_tuned"
+SURE = "sure"  # name of the sweep
 
 
 @dataclass(frozen=True)
@@ -82,8 +82,15 @@ class Candidate:
         return self.option.rpartition("/")[2]
 
 
-def recommend(overrides: Sequence[str]) -> str:
-    """Say which estimators fit, what they did in the nearest judged settings, and what to run.
+class Advice(NamedTuple):
+    """What to tell, and the arguments of the sweep that settles it, which is named `SURE`."""
+
+    text: str
+    sweep: list[str]
+
+
+def recommend(overrides: Sequence[str]) -> Advice:
+    """Find which estimators fit, what they did in the nearest judged settings, and what to run.
 
     Parameters
     ----------
@@ -115,7 +122,7 @@ def recommend(overrides: Sequence[str]) -> str:
             "",
         ]
     lines += _needed(each for each in everyone if each.missing)
-    return "\n".join([*lines, *_to_be_sure(overrides, fits, nearest)])
+    return Advice("\n".join(lines), _to_be_sure(overrides, fits, nearest))
 
 
 def _candidates(composer: Composer, overrides: Sequence[str]) -> Iterable[Candidate]:
@@ -299,7 +306,7 @@ def _compared(candidate: Candidate) -> list[str]:
 
 
 def _changes(asked: Setting, row: Judged, keys: Iterable[str]) -> dict[str, float]:
-    """Keys in which a row's setting differs, and how far: in decades, 1 for what is no number."""
+    """Keys in which a row's setting differs, and how far: in decades, or 1."""
     swept = [key for key in row.setting if key.startswith("estimator.")]
     pairs = {key: (asked.get(key), row.setting.get(key)) for key in [*keys, *swept]}
     return {key: _apart(*pair) for key, pair in pairs.items() if pair[0] != pair[1]}
@@ -324,20 +331,15 @@ def _needed(others: Iterable[Candidate]) -> list[str]:
 def _to_be_sure(
     overrides: Sequence[str], fits: Sequence[Candidate], nearest: Sequence[Nearest]
 ) -> list[str]:
-    """A sweep of the best ones in the asked setting itself, on seeds that nothing was tuned on."""
+    """Arguments of a sweep of the best ones, on seeds that nothing was tuned on."""
     options = {each.name: each.option for each in fits if each.installed}
     ranked = dict.fromkeys(name for found in nearest for _, name in found.errors())
     names = dict.fromkeys(name.removesuffix(_TUNED) for name in [*ranked, *options])
     tried = [options.get(f"{n}{_TUNED}", options[n]) for n in names if n in options][:_MOST_TRIED]
     exact = any(override.startswith("simulation.") for override in overrides)
     words = [*overrides, *([] if exact else ["simulation.rays=exact"])]
-    words += [f"estimator={','.join(tried)}", "seed=range(1000,1010)", "name=sure"]
-    return [
-        "",
-        "To be sure, run the best in your own setting:",
-        f"  estima run -m {shlex.join(words)}",
-        f"  estima table sure --against {tried[0].rpartition('/')[2]} --times",
-    ]
+    words += [f"estimator={','.join(tried)}", "seed=range(1000,1010)", f"name={SURE}"]
+    return words
 
 
 def _mean(errors: Iterable[float]) -> float:
