@@ -333,9 +333,11 @@ def _to_be_sure(
 ) -> list[str]:
     """Arguments of a sweep of the best ones, on seeds that nothing was tuned on."""
     options = {each.name: each.option for each in fits if each.installed}
-    ranked = dict.fromkeys(name for found in nearest for _, name in found.errors())
-    names = dict.fromkeys(name.removesuffix(_TUNED) for name in [*ranked, *options])
-    tried = [options.get(f"{n}{_TUNED}", options[n]) for n in names if n in options][:_MOST_TRIED]
+    ranked = [name for found in nearest for _, name in found.errors() if name in options]
+    best: dict[str, str] = {}  # of a method and its tuned variant
+    for name in [*ranked, *options]:
+        best.setdefault(name.removesuffix(_TUNED), options[name])
+    tried = [*best.values()][:_MOST_TRIED]
     exact = any(override.startswith("simulation.") for override in overrides)
     words = [*overrides, *([] if exact else ["simulation.rays=exact"])]
     words += [f"estimator={','.join(tried)}", "seed=range(1000,1010)", f"name={SURE}"]

@@ -32,6 +32,7 @@ from experiments.runs.targets import make
 from sim.arrays import Array
 from sim.errors import InputError, blaming, require, required
 from sim.options import build
+from sim.people.walk import People
 from sim.recording import Frame, Recording
 from sim.robot.base import RobotGeometry, robot_from_config
 from sim.sensors import Sensor, Sensors, sensors_from_config
@@ -169,7 +170,11 @@ class Objects:
         simulation = dataclasses.asdict(
             build(SimulationOptions, self.config["simulation"], "simulation")
         )
-        return record_team(self.world(), members, **simulation, on_progress=on_progress)
+        people = build(People, self.config["people"], "people")
+        passers_by = people, stream(self.seed, "people")
+        return record_team(
+            self.world(), members, **simulation, passers_by=passers_by, on_progress=on_progress
+        )
 
     def simulate(
         self,
@@ -255,7 +260,7 @@ class Objects:
     ) -> Callable[[Frame], Array]:
         """Start the estimator that the route's feedback names; it knows the start and the map."""
         estimator = self._steering()
-        prior = Prior(robot, sensors, start.copy(), np.zeros((3, 3)), world)
+        prior = Prior(robot, sensors, start.copy(), np.zeros((3, 3)), world.known)
         with blaming("route.feedback"):
             estimator.reset(prior, stream(self.config["seed"], "onboard"))
         return lambda frame: estimator.step(frame).mean

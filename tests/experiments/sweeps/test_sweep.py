@@ -353,7 +353,7 @@ def test_a_job_tried_again_goes_on(tmp_path, monkeypatch):
     """As Ray and SLURM do it, in the midst of a line."""
     every = plan.make_plan([*QUICK, "seed=range(0,4)"])
     jobs = launch.Jobs(tmp_path, 1)
-    jobs.add(every, np.arange(4))
+    jobs.add(*next(every.split(np.arange(4), 1)))
     share = json.loads(work.share_path(jobs.plan, 0).read_text())
     ran = []
 

@@ -413,7 +413,7 @@ def test_a_file_does_not_choose_what_is_imported(recording, tmp_path, trap, endi
     same_log(recording.log("beacons"), back.log("beacons"))
     CliRunner().invoke(app, ["info", str(tmp_path / f"evil{ending}")])
     assert "trap_module" not in sys.modules
-    with pytest.raises(SystemExit):  # it is armed
+    with pytest.raises(InputError, match="a file chose"):  # it is armed
         sensors_from_config({"s": {"_target_": trap}})
 
 

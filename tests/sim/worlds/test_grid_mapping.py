@@ -18,6 +18,7 @@ from sim.errors import InputError
 from sim.recording import save
 from sim.team import Team
 from sim.worlds.buildings import from_grid
+from sim.worlds.floor_plan import gaps_m
 from sim.worlds.grid import rasterize
 from sim.worlds.grid_mapping import _between, map_scans
 from tests.experiments.cli.test_cli import called, refused
@@ -191,3 +192,14 @@ def test_what_the_command_line_refuses(tmp_path):
         error = CliRunner().invoke(app, words).exception
         assert isinstance(error, InputError)
         assert said in str(error)
+
+
+def test_a_tour_is_planned_through_a_grid_without_way_points():
+    world = from_grid(rng=np.random.default_rng(0), path=str(MAP), stops=5)
+    legs = np.hstack([world.waypoints[:-1], world.waypoints[1:]])
+    assert gaps_m(legs, world.walls).min() > 0.4
+    assert np.array_equal(world.waypoints[0], world.waypoints[-1])
+    again = from_grid(rng=np.random.default_rng(1), path=str(MAP), stops=5)
+    assert not np.array_equal(world.waypoints[0], again.waypoints[0])
+    with pytest.raises(InputError, match="stops"):
+        from_grid(rng=np.random.default_rng(0), path=str(MAP), stops=1)
