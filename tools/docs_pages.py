@@ -242,7 +242,7 @@ def _gallery() -> Iterator[str]:
         for study in sorted(path.parent.name for path in room.glob("*/findings.yaml")):
             page = findings(study)
             yield f"## {page['title']}\n\n{' '.join(page['about'].split())}\n"
-            commands = OWN.get(study) or [reproduce_command(study, full=True)]
+            commands = OWN.get(study) or [reproduce_command(study)]
             yield "```text\n" + "\n".join(commands) + "\n```\n"
             for name, figure in page["figures"].items():
                 if (ROOT / "results" / "figures" / f"{name}.png").exists():

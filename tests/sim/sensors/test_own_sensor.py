@@ -11,7 +11,6 @@ from typer.testing import CliRunner
 from experiments.cli.main import app
 from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
-from experiments.runs.version import source_digest
 from experiments.trajectories.convert import write_recording
 from sim.errors import InputError
 from sim.formats.detect import read_any
@@ -248,19 +247,6 @@ def test_from_the_configuration_to_a_row(tmp_path, monkeypatch):
     ):
         with pytest.raises(InputError, match=words):
             Experiment.compose([f"+sensors.beacons={wrong}", *QUICK]).simulate()
-
-
-def test_an_edited_sensor_is_another_recording(tmp_path, monkeypatch):
-    monkeypatch.syspath_prepend(str(tmp_path))
-    plain = Experiment.compose(QUICK)
-    experiment = Experiment.compose(["+sensors.one={_target_: sensor_for_key.One}", *QUICK])
-    keys = [plain.recording_key]
-    for text in ("class One: pass\n", "class One: x = 1\n"):
-        (tmp_path / "sensor_for_key.py").write_text(text)
-        source_digest.cache_clear()
-        keys.append(experiment.recording_key)
-    assert len(set(keys)) == 3
-    assert plain.recording_key == keys[0]
 
 
 def test_a_reading_without_a_field_of_the_schema_is_named():

@@ -10,6 +10,8 @@ import yaml
 from typer.testing import CliRunner
 
 from experiments.cli.main import app
+from experiments.runs.dependencies.digests import changed
+from experiments.runs.dependencies.recorder import recorded
 from experiments.runs.experiment import Experiment
 from experiments.viewing.animation import pictures
 from experiments.viewing.map import grid_along, path_of
@@ -107,18 +109,21 @@ def copied(folder):
 GRID_RUN = ["estimator=mcl", "sensors=hokuyo", "simulation.physics=kinematic"]
 
 
-def test_an_edited_image_is_another_experiment_and_another_world(tmp_path):
+def test_what_reads_a_grid_depends_on_its_image(tmp_path):
     path = copied(tmp_path)
     known = Experiment.compose([*GRID_RUN, f"prior.map={path}"])
     world = Experiment.compose(["world=from_grid", f"world.path={path}"])
-    made = Experiment.compose(
-        [*GRID_RUN, f"prior.map={{_target_: sim.worlds.grid_file.read_grid, path: {path}}}"]
-    )
-    before = known.key, world.recording_key, made.key
-    known.check()
+    target = f"prior.map={{_target_: sim.worlds.grid_file.read_grid, path: {path}}}"
+    made = Experiment.compose([*GRID_RUN, target])
     image = path.with_suffix(".pgm")
+    seen = []
+    for read in (known.check, world.world, lambda: made._map(None)):
+        with recorded() as found:
+            read()
+        seen.append(found.digests())
+        assert {str(path), str(image)} <= set(seen[-1])
     image.write_bytes(image.read_bytes()[:-1] + b"\0")
-    assert not set(before) & {known.key, world.recording_key, made.key}
+    assert [changed(each) for each in seen] == [[str(image)]] * 3
 
 
 def test_an_estimator_that_cannot_use_a_grid_refuses_it_before_any_run():
