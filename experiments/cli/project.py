@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from experiments.cli import completion
+from experiments.cli.flags import ConfigDir, gathered
 from experiments.runs import paths
 
 
@@ -74,6 +76,29 @@ def cache(
     print(f"{paths.short(folder())}: {len(kept)} recordings, {size:.2f} of {limit:g} GiB")
 
 
+@dataclass(frozen=True)
+class Reports:
+    """What a check writes."""
+
+    junit: Annotated[Path | None, typer.Option(help="JUnit XML to write.")] = None
+    summary: Annotated[Path | None, typer.Option(help="Markdown to write.")] = None
+
+
+@dataclass(frozen=True)
+class Elsewhere:
+    """Trajectories that were made elsewhere."""
+
+    candidate: Annotated[
+        Path | None,
+        typer.Option(help="Folder of trajectories that were made elsewhere, to judge instead."),
+    ] = None
+    recordings: Annotated[
+        Path | None,
+        typer.Option(help="Only write the recordings for them, without the truth, to this folder."),
+    ] = None
+
+
+@gathered
 def check(
     suite: Annotated[
         str,
@@ -95,16 +120,10 @@ def check(
     release: Annotated[
         bool, typer.Option("--release", help="With --accept: pin the release baseline too.")
     ] = False,
-    junit: Annotated[Path | None, typer.Option(help="JUnit XML to write.")] = None,
-    summary: Annotated[Path | None, typer.Option(help="Markdown to write.")] = None,
-    candidate: Annotated[
-        Path | None,
-        typer.Option(help="Folder of trajectories that were made elsewhere, to judge instead."),
-    ] = None,
-    recordings: Annotated[
-        Path | None,
-        typer.Option(help="Only write the recordings for them, without the truth, to this folder."),
-    ] = None,
+    *,
+    reports: Reports,
+    elsewhere: Elsewhere,
+    config_dir: ConfigDir = None,
 ) -> None:
     """Compare all estimators' errors with the baseline; code 1 if one is worse.
 
@@ -120,17 +139,27 @@ def check(
 
       estima check --accept "descriptors of half the size: 2 % worse, twice as fast"
 
+      estima check --suite mine.yaml --config-dir mine
+
       estima check --suite mine.yaml --recordings in
 
       estima check --suite mine.yaml --candidate out
     """
-    if recordings is not None:
+    if elsewhere.recordings is not None:
         from experiments.gate.candidate import export_recordings
 
-        print(export_recordings(suite, only or [], recordings))
+        print(export_recordings(suite, only or [], elsewhere.recordings))
         return
     from experiments.gate.report import run_check
 
-    reports = {"junit": junit, "summary": summary}
-    if run_check(suite, accept, only or [], release=release, candidate=candidate, **reports):
+    worse = run_check(
+        suite,
+        accept,
+        only or [],
+        release=release,
+        candidate=elsewhere.candidate,
+        config_dir=config_dir,
+        **vars(reports),
+    )
+    if worse:
         raise typer.Exit(1)
