@@ -48,14 +48,22 @@ def bench(
         ),
     ] = "all",
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    against: Annotated[
+        str | None,
+        typer.Option(help="A git revision that runs in turn with this code; gives ratios to it."),
+    ] = None,
 ) -> None:
     """Measure speeds and accuracies on one core, beside their goals.
 
-    Example: estima bench sim --json
+    Examples
+    --------
+      estima bench sim --json
+
+      estima bench fastslam --against v0.2
     """
     from experiments.bench import run_bench
 
-    print(run_bench(name, as_json=as_json))
+    print(run_bench(name, as_json=as_json, against=against))
 
 
 def cache(
@@ -124,6 +132,10 @@ def check(
     reports: Reports,
     elsewhere: Elsewhere,
     config_dir: ConfigDir = None,
+    speed: Annotated[
+        str | None,
+        typer.Option(help="Only compare the times of steps with those at this git revision."),
+    ] = None,
 ) -> None:
     """Compare all estimators' errors with the baseline; code 1 if one is worse.
 
@@ -134,6 +146,8 @@ def check(
     Examples
     --------
       estima check
+
+      estima check --speed v0.2
 
       estima check --junit check.xml
 
@@ -149,6 +163,12 @@ def check(
         from experiments.gate.candidate import export_recordings
 
         print(export_recordings(suite, only or [], elsewhere.recordings))
+        return
+    if speed is not None:
+        from experiments.gate.speed import run_speed
+
+        if run_speed(suite, speed, only or [], config_dir):
+            raise typer.Exit(1)
         return
     from experiments.gate.report import run_check
 

@@ -247,7 +247,7 @@ def run_suite(
         runs = [
             (
                 entry,
-                suite.compose(_overrides(suite, entry)).with_values(repeats=repeats[entry.name]),
+                suite.compose(overrides_of(suite, entry)).with_values(repeats=repeats[entry.name]),
                 (planted or {}).get(entry.name),
             )
             for entry in suite.estimators
@@ -274,7 +274,7 @@ def draw_run(suite: Suite, estimator: str, recording: int, path: Path) -> bool:
         estimates.append((read, revised if entry.revised and revised is not None else online))
 
     (row, *_) = evaluate(
-        suite.compose(_overrides(suite, entry, recording)).with_values(repeats=1),
+        suite.compose(overrides_of(suite, entry, recording)).with_values(repeats=1),
         streams=partial(_stream, f"estimator/{estimator}", recording, 0),
         on_estimate=keep,
     )
@@ -290,13 +290,13 @@ def command_of(suite: Suite, estimator: str, recording: int) -> str:
         [
             "estima",
             "run",
-            *_overrides(suite, entry, recording),
+            *overrides_of(suite, entry, recording),
             *config_dir_option(suite.config_dir),
         ]
     )
 
 
-def _overrides(suite: Suite, entry: Entry, seed: int | None = None) -> list[str]:
+def overrides_of(suite: Suite, entry: Entry, seed: int | None = None) -> list[str]:
     """Overrides of an estimator over its recordings, or over the one of a seed."""
     seeds = [] if seed is None else [f"seed={seed}", f"world_seed={seed}"]
     of_group = suite.overrides[entry.recordings]
