@@ -68,11 +68,11 @@ def checkout(revision: str, folder: Path | None = None) -> Checkout:
         The clone; by default that of the running code.
     """
     require(not revision.startswith("-"), f"{revision} is not a revision")
-    commit = git("rev-parse", "--verify", "--quiet", f"{revision}^{{commit}}", folder=folder)
+    commit = git("rev-parse", f"{revision}^{{commit}}", folder=folder)
     place = paths.results() / "cache" / "checkouts" / commit[:12]
     if not (place / ".git").exists():
         place.parent.mkdir(parents=True, exist_ok=True)
-        git("worktree", "add", "--detach", "--force", str(place), commit, folder=folder)
+        git("worktree", "add", "-d", "-f", str(place), commit, folder=folder)
     here, there = ((f / _LOCK) for f in (folder or paths.SOURCE, place))
     if here.exists() and (not there.exists() or here.read_bytes() != there.read_bytes()):
         warn(f"estima: {_LOCK} differs at {revision}; both run in the environment of now")

@@ -1,4 +1,4 @@
-"""Commands on the project: check, reproduce, bench, cache."""
+"""Commands on the project: check, bisect, reproduce, bench, cache."""
 
 from __future__ import annotations
 
@@ -183,3 +183,31 @@ def check(
     )
     if worse:
         raise typer.Exit(1)
+
+
+def bisect(
+    good: Annotated[str, typer.Argument(help="A git revision at which nothing was worse.")],
+    bad: Annotated[str, typer.Argument(help="A later one, at which something is.")] = "HEAD",
+    suite: Annotated[
+        str,
+        typer.Option(
+            help="Suite of conf/suite, or a .yaml file.", autocompletion=completion.suites
+        ),
+    ] = "check",
+    only: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="An estimator; repeat it. Else all of the suite.",
+            autocompletion=completion.estimators,
+        ),
+    ] = None,
+) -> None:
+    """Find the commit that made an estimator's errors worse.
+
+    Every revision that is checked is a worktree in the cache of the results' folder.
+
+    Example: estima bisect v0.2 --only fastslam
+    """
+    from experiments.gate.bisect import run_bisect
+
+    run_bisect(good, bad, suite, only or [])
