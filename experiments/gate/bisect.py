@@ -7,6 +7,7 @@ streams. Where chance leaves that open, all three run again with other streams.
 
 import json
 import math
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
@@ -138,11 +139,15 @@ def _of(estimator: str, rows: pd.DataFrame) -> pd.DataFrame:
 def history(good: str, bad: str, folder: Path | None = None) -> list[str]:
     """Commits from a good one to a bad one, both included, along the first parents."""
     first, last = (git("rev-parse", f"{name}^{{commit}}", folder=folder) for name in (good, bad))
-    listed = git(
-        *("rev-list", "--reverse", "--first-parent", f"{first}..{last}"), folder=folder
-    ).split()
-    require(listed, f"{good} is not before {bad}")
-    return [first, *listed]
+    commits = [last]
+    while commits[0] != first:
+        parents = git("cat-file", "-p", commits[0], folder=folder).partition("\n\n")[0]
+        before = re.search("^parent (.*)$", parents, re.MULTILINE)
+        if before is None:
+            raise InputError(f"{good} is not before {bad}")
+        commits.insert(0, before[1])
+    require(len(commits) > 1, f"{good} is {bad}")
+    return commits
 
 
 def run_bisect(good: str, bad: str, suite: str, only: Sequence[str]) -> None:
@@ -158,7 +163,7 @@ def run_bisect(good: str, bad: str, suite: str, only: Sequence[str]) -> None:
     commits = history(good, bad)
 
     def measure(commit: str, names: Sequence[str], seeding: int) -> pd.DataFrame:
-        show(f"{git('show', '-s', '--format=%h %s', commit)}")
+        show(f"checking {commit[:12]}")
         given = json.dumps([str(path), list(names), seeding])
         return pd.DataFrame(run_in(checkout(commit).folder, _ROWS, given))
 
@@ -168,10 +173,7 @@ def run_bisect(good: str, bad: str, suite: str, only: Sequence[str]) -> None:
 def as_text(blame: Blame, folder: Path | None = None) -> str:
     """The commit, its message, what it made worse, and on which recordings."""
     lines = [
-        printable(line)
-        for line in git("show", "-s", "--format=%H%n%an, %ad%n%n%B", blame.commit, folder=folder)
-        .strip()
-        .splitlines()
+        printable(line) for line in git("show", "-s", blame.commit, folder=folder).splitlines()
     ]
     lines += ["", sentence(blame.finding)]
     lines += [
