@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 from experiments.judging.claim import Claim, Role, Verdict
-from experiments.judging.results import Profile
+from experiments.judging.results import Profile, reproduce_command
 from experiments.judging.sentences import Conclusion
 from experiments.runs.row import read_rows, write_frame
 from experiments.runs.version import code_version, describe_machine
@@ -44,7 +44,7 @@ _TEXTS = {
     **{name: ("|".join(kind), f"one of {', '.join(kind)}") for name, kind in _ENUMS.items()},
 }
 _ORIGIN = ("profile", "seconds", "code_version")
-_REMEDY = "restore it by `git checkout`, or delete it and run `estima reproduce`"
+_REMEDY = f"restore it by `git checkout`, or delete it and run `{reproduce_command(None)}`"
 
 
 def write_claims(
