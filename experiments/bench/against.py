@@ -135,7 +135,9 @@ def alternate(
     runs = [*times[new], *times[old]]
     names = [name for name in runs[0] if all(run.get(name, 0.0) > 0.0 for run in runs)]
     return {
-        name: log_ratio_interval(*([run[name] for run in times[side]] for side in (new, old)))
+        name: log_ratio_interval(
+            [run[name] for run in times[new]], [run[name] for run in times[old]]
+        )
         for name in names
     }
 
