@@ -16,6 +16,7 @@ from experiments.judging.claim import Claim, Subject, Verdict, beside
 from experiments.judging.claims_file import (
     note_provenance,
     read_claims,
+    read_verdicts,
     write_claims,
     write_verdicts,
 )
@@ -429,12 +430,14 @@ def test_a_tuned_method_is_no_second_one_and_ties_are_said(tmp_path):
     assert not any(row["level"] for row in leaderboard.on_lasers(path)["rows"])
 
 
-def test_what_a_paper_does_not_claim_is_not_counted_as_its_claim():
+def test_what_a_paper_does_not_claim_is_not_counted_as_its_claim(tmp_path):
     rows = [{"role": "headline", "verdict": v, "profile": "full", "paper": "maximo2024"} for v in
             ("not_reproduced", "reproduced")]  # fmt: skip
     table = pd.DataFrame(rows).assign(id=["MX1", "MX6"])
     about = {"maximo2024": contents.findings("maximo2024")}
-    claims = contents.judged_claims(table, about, {})
+    claims = contents.judged_claims(
+        table, about, read_verdicts(tmp_path / "none.csv").set_index("id")
+    )
     assert [key for key, claim in claims.items() if claim["own"]] == ["MX6", "MX7", "MX8"]
 
 
