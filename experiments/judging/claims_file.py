@@ -126,18 +126,18 @@ def criteria(study: str) -> Callable[[str], dict[str, str]]:
         If a date or an answer there is none.
     """
     given = findings(study).get("criteria", {})
-    for claim, of in given.items():
-        good = isinstance(of, dict) and isinstance(of.get("since"), date)
-        good = good and isinstance(of.get("after_data"), bool)
+    for claim, own in given.items():
+        good = isinstance(own, dict) and isinstance(own.get("since"), date)
+        good = good and isinstance(own.get("after_data"), bool)
         where = f"{study}/findings.yaml: criteria.{claim}"
         require(good, f"{where}: needs since, a date, and after_data, true or false")
 
-    def of(claim: str) -> dict[str, str]:
+    def since(claim: str) -> dict[str, str]:
         own = given.get(claim, {"since": FIRST_CRITERIA, "after_data": False})
         answer = "yes" if own["after_data"] else "no"
         return {"criterion_since": own["since"].isoformat(), "after_data": answer}
 
-    return of
+    return since
 
 
 def _replace(new: pd.DataFrame, old: pd.DataFrame, path: Path, paper: str) -> None:

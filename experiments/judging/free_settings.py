@@ -231,7 +231,7 @@ def find_anchor(
         reached = np.flatnonzero(off <= max(near / 5.0, float(off.min())))
         best = int(reached[distance[reached].argmin()])
         values = table_at(settings, tried[[best]]).iloc[0].to_dict()
-        level = measure(values)
+        level = float(measure(values))
         if abs(math.log(level / printed)) <= near:
             return Anchor(values, level)
         shift = math.log(printed) - (math.log(level) - float(foreseen[best]))

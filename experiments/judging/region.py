@@ -100,9 +100,8 @@ class Region:
     decided_by: str
     boundary: str
 
-    @property
-    def words(self) -> str:
-        """What decides, and where it lies, in a sentence or two."""
+    def words(self, at_anchor: Verdict) -> str:
+        """Say in how much of the region the claim holds, what decides, and where the paper lies."""
         ends = [f"{100.0 * v:.0f}" for v in (self.share.value, self.share.low, self.share.high)]
         said = f"It holds in {ends[0]} % [{ends[1]}, {ends[2]}] of the region of free settings"
         if self.boundary in (NOWHERE, EVERYWHERE):
@@ -116,7 +115,9 @@ class Region:
         printed = "where the printed level comes out"
         if not math.isfinite(self.anchor.level):
             printed = "the middle of the ranges, as no level is printed"
-        return f"{said}. The anchor, {printed}, is {self.anchor.words}."
+        lies = {Verdict.REPRODUCED: "it holds", Verdict.NOT_REPRODUCED: "it does not hold"}
+        there = lies.get(at_anchor, "it is undecided")
+        return f"{said}. At the anchor ({self.anchor.words}), {printed}, {there}."
 
 
 def fit(

@@ -64,7 +64,7 @@ def conclude(
         verdict = at_anchor = headline_verdict([(row.role, row.verdict) for row in rows])
         said, region = sentence(findings["sentences"][key], rows), regions.get(key)
         if region:
-            verdict, said = rule(at_anchor, region.share), f"{said} {region.words}"
+            verdict, said = rule(at_anchor, region.share), f"{said} {region.words(at_anchor)}"
         if verdict is Verdict.UNDECIDED:
             said += power_stated(rows)
         conclusions.append(Conclusion(key, verdict, said, region, at_anchor))
