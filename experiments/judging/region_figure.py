@@ -32,7 +32,7 @@ def draw_region(
     points
         The sampled settings.
     quantity
-        What the first headline's ratio is of, in words.
+        The first headline's ratio, in words.
     printed
         The paper's own ratio; None if it prints none.
     """
