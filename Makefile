@@ -6,8 +6,8 @@ FULL ?= 0
 .PHONY: help setup reproduce report test test-all lint types format docs lock peers clean
 
 help:
-	@echo "make reproduce         figures, tables and claims from few repeats, into results/quick/"
-	@echo "make reproduce FULL=1  the judged ones, into results/"
+	@echo "make reproduce         rows of the judged tables made again; figures and claims from them"
+	@echo "make reproduce FULL=1  every row again, into results/"
 	@echo "make report            the page of results/, results/report.html"
 	@echo "make test              the default tests"
 	@echo "make test-all          the slow ones too"

@@ -1,14 +1,22 @@
-"""Make all papers' tables, figures and claims in results/, as `make reproduce` does."""
+"""Make all papers' tables, figures and claims in results/, and check those that are there."""
 
-import importlib
 import os
 import re
+import shutil
 import tempfile
 import time
 from collections import Counter
 from pathlib import Path
-from types import ModuleType
 
+from experiments.audit import audit
+from experiments.judging.built import (
+    Built,
+    State,
+    dependencies_of,
+    list_built,
+    note_built,
+    table_dependencies,
+)
 from experiments.judging.claim import Claim, Verdict
 from experiments.judging.claims_file import (
     note_provenance,
@@ -17,50 +25,92 @@ from experiments.judging.claims_file import (
     write_claims,
     write_verdicts,
 )
-from experiments.judging.folders import code_folder, findings
+from experiments.judging.folders import LOGS, OWN, STUDIES, findings
+from experiments.judging.folders import part as _part
+from experiments.judging.jobs import in_parallel
 from experiments.judging.logs import why_missing
 from experiments.judging.results import Profile, Results, reproduce_command
 from experiments.judging.sentences import Conclusion, conclude
 from experiments.report.page import write_report
-from experiments.runs.console import progress, show, warn
+from experiments.runs.console import pluralize, progress, show, warn
+from experiments.runs.dependencies.recorder import recorded
 from experiments.runs.paths import results, short
 from experiments.viewing.style import save_figure
 from sim.errors import InputError
 
-PAPERS = ("puzzlebot2024", "decristoforis2020", "maximo2024", "gil2008")
-LOGS = ("real_logs", "twins")  # run only where the logs are
-NAMED = ("teams", "exploration")  # judged, run when named
-OWN = (
-    "mcl_office",
-    "fastslam_consistency",
-    "peers",
-)  # our own, which judge no claim: run when named
 _APART = "_tuning"  # the table on other seeds from which parameters were chosen
+_AGAIN = "reproduced"  # folder in the results
+Items = dict[str, tuple[dict[str, str], float]]  # dependencies and seconds, by name
 
 
-def reproduce(*, full: bool = False, only: str | None = None) -> None:
+def check_results(minutes: float = 2.0) -> bool:
+    """Check the judged results: audit the tables, and make from them all that is made of them.
+
+    Figures, claims and the report go to `results/reproduced`, which is not committed.
+
+    Returns
+    -------
+    bool
+        Whether all rows made again are equal, and all verdicts the judged ones.
+    """
+    equal = audit(minutes, None, seed=0)
+    place = results() / _AGAIN
+    shutil.rmtree(place, ignore_errors=True)
+    for kind in ("tables", "arrays", "figures"):
+        shutil.copytree(results() / kind, place / kind)
+    for name in ("provenance.json", "claims.csv", "verdicts.csv"):
+        shutil.copy(results() / name, place / name)
+    jobs = [(place, study) for study in STUDIES if _can_be_drawn(place, study)]
+    with progress("figures and claims", 1.0) as on_progress:
+        made = dict(zip((s for _, s in jobs), in_parallel(_again, jobs, on_progress), strict=True))
+    judged = read_verdicts(results() / "verdicts.csv").set_index("id")
+    for study, (n_figures, conclusions, claims) in made.items():
+        _write(claims, conclusions, place, study, Profile.FULL)
+        said = []
+        for each in conclusions:
+            row = judged.loc[each.id] if each.id in judged.index else None
+            same = row is not None and (row["verdict"], row["sentence"]) == (
+                str(each.verdict),
+                each.sentence,
+            )
+            equal &= same
+            said.append(f"{each.id} {each.verdict.label}" + " (not as judged)" * (not same))
+        show(f"{study}: {pluralize(n_figures, 'figure')}; {', '.join(said) or 'judges no claim'}")
+    show(f"{short(write_report(place))} has all of it; open it in a browser")
+    return equal
+
+
+def _can_be_drawn(place: Path, study: str) -> bool:
+    """Whether a study's tables are here, and of real logs what is drawn of them."""
+    drawn = study not in LOGS or any((place / "arrays").glob(f"{study}_*.npz"))
+    return drawn and any((place / "tables").glob(f"{study}_*.csv"))
+
+
+def _again(place: Path, study: str) -> tuple[int, list[Conclusion], list[Claim]]:
+    """Draw a study's figures and judge its claims from its tables; the number of figures."""
+    made = Results(place, study)
+    with made.blaming_files():
+        n_figures = _draw(made)
+        claims, conclusions = ([], []) if study in OWN else judgement(made)
+    return n_figures, conclusions, claims
+
+
+def reproduce(only: str | None = None) -> None:
     """Run the studies, judge the claims, draw the figures, write the report.
-
-    The quick profile has a folder of its own, `results/quick`.
 
     Parameters
     ----------
-    full
-        Run the full profile, not the quick one, whose verdicts are marked quick.
     only
-        A paper's short name, or None for all papers.
+        A study's short name, or None for all.
     """
-    profile = Profile.FULL if full else Profile.QUICK
-    place = folder_of(profile)
-    read_claims(place / "claims.csv")  # a damaged table ends the command before hours are spent
-    read_verdicts(place / "verdicts.csv")
+    _check_claims()
     lines = []
     for paper in _chosen(only):
         begun = time.monotonic()
         if paper in LOGS and (why := why_missing()):
             warn(f"{paper}: left out, {why}")
             continue
-        conclusions = reproduce_paper(paper, profile)
+        conclusions = reproduce_paper(paper, Profile.FULL)
         for each in conclusions:
             show(f"{each.id:<4} {each.verdict.label:<15} {first_sentence(each.sentence)}")
         counts = Counter(each.verdict for each in conclusions)
@@ -68,9 +118,52 @@ def reproduce(*, full: bool = False, only: str | None = None) -> None:
             f"{counts[verdict]} {verdict.label}" for verdict in Verdict if verdict in counts
         )
         lines.append(f"{paper}: {ruled or 'judges no claim'} ({time.monotonic() - begun:.0f} s)")
-    page = write_report(place)
+    page = write_report(results())
     show("\n".join(["", *lines]))
     show(f"{short(page)} has the figures and tables behind them; open it in a browser")
+
+
+def _check_claims() -> None:
+    """Read the tables of claims: a damaged one ends the command before hours are spent."""
+    read_claims(results() / "claims.csv")
+    read_verdicts(results() / "verdicts.csv")
+
+
+def renew(only: str | None = None) -> None:
+    """Run the studies that have a stale table; of the others, draw and judge what is stale.
+
+    Recordings that have not changed come from the cache.
+    """
+    _check_claims()
+    stale = [each for each in list_built(results()) if each.state is not State.FRESH]
+    chosen = {only} if only is not None else {*STUDIES}
+    for study in [s for s in STUDIES if s in chosen]:
+        own = [each for each in stale if each.study == study and _APART not in each.name]
+        if not own:
+            continue
+        if study in LOGS and (why := why_missing()):
+            warn(f"{study}: {pluralize(len(own), 'result')} stale, left out: {why}")
+            continue
+        show(f"{study}: {pluralize(len(own), 'result')} stale")
+        if any(each.name.startswith("tables/") for each in own):
+            reproduce_paper(study, Profile.FULL)
+        else:
+            _renew_derived(study, own)
+    if stale:
+        show(short(write_report(results())))
+
+
+def _renew_derived(study: str, stale: list[Built]) -> None:
+    """Draw a study's figures and judge its claims again, from its tables, whichever is stale."""
+    place = results()
+    made = Results(place, study)
+    with made.blaming_files():
+        if any(each.name.startswith("figures/") for each in stale):
+            note_built(place, study, _drawn_items(made))
+        if any("/" not in each.name for each in stale):
+            items, claims, conclusions = _judged_items(made)
+            _write(claims, conclusions, place, study, Profile.FULL)
+            note_built(place, study, items)
 
 
 def redraw(only: str | None = None) -> None:
@@ -86,7 +179,7 @@ def redraw(only: str | None = None) -> None:
     if not present:
         raise InputError(
             f"{short(place / 'tables')}: no tables of {only or 'any paper'}; "
-            f"run `{reproduce_command(only, full=True)}`"
+            f"run `{reproduce_command(only)}`"
         )
     for paper in _chosen(only):
         begun = time.monotonic()
@@ -98,7 +191,7 @@ def redraw(only: str | None = None) -> None:
             warn(f"{paper}: left out, what it draws of the logs is not here")
             continue
         with made.blaming_files():
-            _draw(made)
+            note_built(place, paper, _drawn_items(made))
         warn(f"{paper}: {time.monotonic() - begun:.0f} s")
 
 
@@ -107,25 +200,44 @@ def reproduce_paper(paper: str, profile: Profile) -> list[Conclusion]:
 
     The files are written elsewhere first, so an interrupted run leaves the results as they were.
     """
-    begun, place = time.monotonic(), folder_of(profile)
+    begun, place = time.monotonic(), results()
     aside = results() / "cache"  # which is not committed
     aside.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=aside, prefix=f"{paper}-") as name:
         made = Results(Path(name), paper)
-        with progress(paper, 1.0) as on_progress:
-            _part(paper, "study").run(profile, made, on_progress)
-        _draw(made)
-        claims, conclusions = ([], []) if paper in OWN else judgement(made)
+        study = _part(paper, "study")
+        with progress(paper, 1.0) as on_progress, recorded(study.__name__) as seen:
+            study.run(profile, made, on_progress)
+        items = table_dependencies(seen, made.folder)
+        items |= _drawn_items(made)
+        verdicts, claims, conclusions = _judged_items(made)
         for kind in ("tables", "arrays", "figures"):
             _put_in_place(made.folder / kind, place / kind, paper)
         _write(claims, conclusions, place, paper, profile)
         note_provenance(place, paper, profile, time.monotonic() - begun)
+        note_built(place, paper, items | verdicts, only_these=True)
     return conclusions
 
 
-def folder_of(profile: Profile) -> Path:
-    """Return the folder of the judged results, or of the quick ones, which leave those alone."""
-    return results() if profile is Profile.FULL else results() / "quick"
+def _drawn_items(made: Results) -> Items:
+    """Draw a study's figures; what each depends on, and the seconds that all took."""
+    begun = time.monotonic()
+    with recorded(_part(made.paper, "figures").__name__) as seen:
+        _draw(made)
+    found = dependencies_of(seen, made.folder), time.monotonic() - begun
+    paths = sorted((made.folder / "figures").glob(f"{made.paper}_*"))
+    return {f"figures/{path.name}": found for path in paths}
+
+
+def _judged_items(made: Results) -> tuple[Items, list[Claim], list[Conclusion]]:
+    """Judge a study's claims; what each verdict depends on, and the seconds that all took."""
+    if made.paper in OWN:
+        return {}, [], []
+    begun = time.monotonic()
+    with recorded(_part(made.paper, "claims").__name__, conclude.__module__) as seen:
+        claims, conclusions = judgement(made)
+    found = dependencies_of(seen, made.folder), time.monotonic() - begun
+    return {each.id: found for each in conclusions}, claims, conclusions
 
 
 def judgement(made: Results) -> tuple[list[Claim], list[Conclusion]]:
@@ -139,15 +251,18 @@ def judgement(made: Results) -> tuple[list[Claim], list[Conclusion]]:
 def _write(
     claims: list[Claim], conclusions: list[Conclusion], place: Path, paper: str, profile: Profile
 ) -> None:
-    command = reproduce_command(paper, full=profile is Profile.FULL)
+    command = reproduce_command(paper)
     write_claims(claims, place / "claims.csv", paper=paper, profile=profile, command=command)
     says = findings(paper)["claims"]
     write_verdicts(conclusions, place / "verdicts.csv", paper=paper, says=says, profile=profile)
 
 
-def _draw(made: Results) -> None:
-    for title, page in _part(made.paper, "figures").draw(made).items():
+def _draw(made: Results) -> int:
+    """Draw a study's figures; return how many there are."""
+    pages = _part(made.paper, "figures").draw(made)
+    for title, page in pages.items():
         save_figure(page, made.folder / "figures" / f"{title}.png")
+    return len(pages)
 
 
 def _put_in_place(new: Path, old: Path, paper: str) -> None:
@@ -168,15 +283,9 @@ def _put_in_place(new: Path, old: Path, paper: str) -> None:
 
 
 def _chosen(only: str | None) -> tuple[str, ...]:
-    known = (*PAPERS, *LOGS, *NAMED, *OWN)
-    if only is not None and only not in known:
-        raise InputError(f"the paper must be one of {', '.join(known)}, got {only!r}")
-    return (*PAPERS, *LOGS) if only is None else (only,)
-
-
-def _part(paper: str, name: str) -> ModuleType:
-    room = code_folder(paper).parent.name
-    return importlib.import_module(f"experiments.{room}.{paper}.{name}")
+    if only is not None and only not in STUDIES:
+        raise InputError(f"the paper must be one of {', '.join(STUDIES)}, got {only!r}")
+    return STUDIES if only is None else (only,)
 
 
 def first_sentence(text: str) -> str:

@@ -16,7 +16,6 @@ or a plain dataclass, from a mapping of a configuration.
 
 import dataclasses
 import functools
-import importlib
 import inspect
 import math
 from collections.abc import Callable, Mapping
@@ -197,7 +196,7 @@ def find(target: Any, where: str) -> Callable[..., Any]:
     module_name, _, name = target.rpartition(".")
     with blaming(f"{where}._target_={target}"):  # what its module does when it is imported
         try:
-            module = importlib.import_module(module_name)
+            module: Any = __import__(module_name, fromlist=["_"])  # is seen by who records it
         except ModuleNotFoundError as error:
             raise InputError(
                 f"{where}._target_={target}: no module {error.name}; is its folder on PYTHONPATH?"

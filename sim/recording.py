@@ -78,6 +78,8 @@ class Truth:
         By sensor, what its schema marks as truth, row by row as in its log.
     world
         The map, or None.
+    people
+        (T, n, 3) m, m, rad in map: people who walk about; None without any.
     """
 
     stamps: Array
@@ -85,6 +87,7 @@ class Truth:
     wheel_travel_m: Array = field(default_factory=lambda: np.zeros((0, 2)))
     readings: Mapping[str, Mapping[str, Values]] = field(default_factory=dict)
     world: World | None = None
+    people: Array | None = None
 
     def __repr__(self) -> str:
         return f"Truth({len(self.stamps)} poses, {'a' if self.world else 'no'} map)"
@@ -476,6 +479,7 @@ def recording_from_arrays(stored: dict[str, Values], meta: dict[str, Any]) -> Re
             stored["truth.wheel_travel_m"],
             readings=hidden,
             world=world,
+            people=stored.get("truth.people"),
         )
     recording = Recording(
         frame_stamps=stored["frame_stamps"],

@@ -35,6 +35,9 @@ def check_recording(recording: Any) -> None:
         _check_numbers(truth.poses, (n, 3), "truth.poses")
         n_travel = n if len(truth.wheel_travel_m) else 0
         _check_numbers(truth.wheel_travel_m, (n_travel, 2), "truth.wheel_travel_m")
+        if truth.people is not None:
+            n_people = truth.people.shape[1] if truth.people.ndim == 3 else 0
+            _check_numbers(truth.people, (n, n_people, 3), "truth.people")
     for name, log in recording.logs.items():
         _check_stamps(log.stamps, f"{name}.stamps", least=0)
         sensor = recording.sensors[name]

@@ -18,6 +18,9 @@ import numpy as np
 from sim import se2
 from sim.arrays import Array, Values
 from sim.errors import require
+from sim.people.doors import Doors
+from sim.people.giving_way import GivingWay
+from sim.people.walk import Crowd, People
 from sim.recording import CommandLog, Log, Recording, Truth, WheelLog, log_of_readings
 from sim.robot.base import TICK_S, TICKS_PER_S, Robot
 from sim.robot.collisions import Collisions, half_footprint_m, overlaps
@@ -25,12 +28,13 @@ from sim.robot.kinematic import KinematicBody
 from sim.routes.feedback import Feedback, Onboard, feedback_of
 from sim.sensors.base import Rays, Reading, Sensor, Sensors, View, split_schema
 from sim.sensors.firing import Firing, periods, probes
-from sim.sensors.rays import AmongRobots, BulletRays, ExactRays
+from sim.sensors.rays import AmongFaces, AmongPeople, BulletRays, ExactRays, robot_faces
 from sim.team import Team
 from sim.worlds.world import World
 
 Physics = Literal["bullet", "kinematic"]
 RayKind = Literal["bullet", "exact"]
+PassersBy = tuple[People, np.random.Generator]
 _Logs = defaultdict[str, list[tuple[int, Any]]]  # by sensor: tick and reading
 
 _CHECK_EVERY = 6  # ticks between looks for collisions
@@ -105,10 +109,13 @@ def record(
     *,
     physics: Physics = "bullet",
     rays: RayKind = "bullet",
+    passers_by: PassersBy | None = None,
     on_progress: Callable[[float], None] | None = None,
 ) -> Recording:
     """Drive the route of one robot and record what its sensors measure; see `record_team`."""
-    return record_team(world, [member], physics=physics, rays=rays, on_progress=on_progress).only
+    return record_team(
+        world, [member], physics=physics, rays=rays, passers_by=passers_by, on_progress=on_progress
+    ).only
 
 
 def record_team(
@@ -117,6 +124,7 @@ def record_team(
     *,
     physics: Physics = "bullet",
     rays: RayKind = "bullet",
+    passers_by: PassersBy | None = None,
     on_progress: Callable[[float], None] | None = None,
 ) -> Team:
     """Drive the routes of several robots at once and record what their sensors measure.
@@ -130,6 +138,9 @@ def record_team(
         `bullet`: rigid-body dynamics. `kinematic`: the same slip law with ideal rolling.
     rays
         `bullet`, or `exact` for the caster of `sim.sensors.casting`; the geometry is the same.
+    passers_by
+        Who walks there, and their random stream. Robots wait for people, and people walk round
+        robots.
     on_progress
         Called about every simulated second with the simulated time, s.
 
@@ -147,6 +158,10 @@ def record_team(
     require(
         rays != "bullet" or physics == "bullet", "rays=bullet needs physics=bullet; set rays=exact"
     )
+    require(
+        rays != "bullet" or world.materials is None,
+        f"world {world.name} has walls of glass or dark ones; set rays=exact",
+    )
     for member in members:
         periods(member.sensors)  # checks them before anything is built
     starts = [member.route.start(world, member.robot) for member in members]
@@ -159,6 +174,11 @@ def record_team(
         if isinstance(values, np.ndarray):
             values.setflags(write=False)
     now = dict(enumerate(pose for pose, _ in starts))  # poses at the tick
+    crowd = _crowd_of(world, members, [pose for pose, _ in starts], passers_by)
+    doors = None
+    if passers_by is not None and world.doors is not None:
+        (own,) = passers_by[1].spawn(1)
+        doors = Doors(world.doors, np.array([pose for pose, _ in starts]), own)
     statuses: dict[int, str] = {}
     drives: dict[int, _Drive] = {}
     with contextlib.ExitStack() as stack:
@@ -170,7 +190,12 @@ def record_team(
             body, find_trouble, caster = _bodied(world, member.robot, start, physics, rays, stack)
             others = _others(now, number)
             if len(members) > 1:
-                caster = AmongRobots(caster, _bodies_of(members, others))
+                caster = AmongFaces(caster, _bodies_of(members, others))
+            if doors is not None:
+                caster = AmongFaces(caster, doors.faces)
+            if crowd is not None:
+                caster = AmongPeople(caster, crowd)
+                driver = GivingWay(driver, crowd, number, member.robot, _pose_of(body))
             first = View(0.0, start, world, caster, 0.0, start, others())
             firing = probes(member.sensors, member.streams["sensors"], first, others)
             drives[number] = _Drive(member, body, driver, feedback, find_trouble, firing)
@@ -178,6 +203,8 @@ def record_team(
         for tick in itertools.count():
             if len(members) > 1:
                 now.update(enumerate(drive.body.pose for drive in drives.values()))
+            if crowd is not None or doors is not None:
+                _let_move(crowd, doors, tick, [drive.body.pose for drive in drives.values()])
             for number, drive in [*underway.items()]:
                 try:
                     next(drive)
@@ -190,7 +217,7 @@ def record_team(
                 on_progress(tick * TICK_S)
     return Team.on_one_clock(
         [
-            _assemble(world, member, drives[number].logs, statuses[number])
+            _assemble(world, member, drives[number].logs, statuses[number], crowd)
             for number, member in enumerate(members)
         ]
     )
@@ -213,6 +240,29 @@ def _check_starts(world: World, members: Sequence[Member], poses: Sequence[Array
             f"robots {one} and {other} start within each other, {apart_m:.2f} m apart; give one "
             "another start by its route in team.robots",
         )
+
+
+def _crowd_of(
+    world: World, members: Sequence[Member], poses: Sequence[Array], passers_by: PassersBy | None
+) -> Crowd | None:
+    """The people at work, if there are any."""
+    if passers_by is None or passers_by[0].n == 0:
+        return None
+    return Crowd(passers_by[0], world, [member.robot for member in members], poses, passers_by[1])
+
+
+def _let_move(crowd: Crowd | None, doors: Doors | None, tick: int, poses: Sequence[Array]) -> None:
+    """Let people and doors move at a tick, with the robots at poses (3,)."""
+    if crowd is not None:
+        crowd.advance(tick, poses)
+    if doors is not None:
+        walking = np.zeros((0, 3)) if crowd is None else crowd.at(np.array(crowd.now_s))[:, :3]
+        doors.advance(tick, np.vstack([poses, walking]))
+
+
+def _pose_of(body: Body) -> Callable[[], Array]:
+    """Function that gives a body's pose (3,) as it is now."""
+    return lambda: body.pose
 
 
 def _bodied(
@@ -241,9 +291,9 @@ def _others(now: Mapping[int, Array], number: int) -> Callable[[], Mapping[int, 
 
 def _bodies_of(
     members: Sequence[Member], others: Callable[[], Mapping[int, Array]]
-) -> Callable[[], list[tuple[Robot, Array]]]:
-    """Function that gives the other robots and their poses at this tick."""
-    return lambda: [(members[other].robot, pose) for other, pose in others().items()]
+) -> Callable[[], tuple[Array, Array]]:
+    """Function that gives the faces of the other robots at this tick, and their heights."""
+    return lambda: robot_faces([(members[other].robot, pose) for other, pose in others().items()])
 
 
 class _Drive:
@@ -268,10 +318,13 @@ class _Drive:
         body, logs, fire_every = self.body, self.logs, periods(self._member.sensors)
         slip = robot.start_slip(TICK_S, self._member.streams["slip"])
         encoder, travel = np.zeros(2), np.zeros(2)
+        sweeps = [firing for firing in self._firing.values() if firing.sweeps]
         tick, velocity, speeds = 0, (0.0, 0.0), (0.0, 0.0)
         while True:
             pose = body.pose
             pose.setflags(write=False)
+            for sweeping in sweeps:
+                sweeping.follow(tick / TICKS_PER_S, pose)
             due = [name for name, period in fire_every.items() if tick % period == 0]
             wanted = driver.command(tick, feedback.pose(tick, pose, encoder))
             if due or wanted is None:
@@ -306,7 +359,9 @@ class _Drive:
             yield
 
 
-def _assemble(world: World, member: Member, logs: _Logs, status: str) -> Recording:
+def _assemble(
+    world: World, member: Member, logs: _Logs, status: str, crowd: Crowd | None
+) -> Recording:
     def read(name: str) -> tuple[Array, list[Any]]:
         ticks = np.array([tick for tick, _ in logs[name]], dtype=np.int64)
         return ticks / TICKS_PER_S, [reading for _, reading in logs[name]]
@@ -315,6 +370,7 @@ def _assemble(world: World, member: Member, logs: _Logs, status: str) -> Recordi
     encoder, travel, poses = (np.array(part) for part in zip(*frames, strict=True))
     poses[:, 2] = se2.wrap(poses[:, 2])
     command_stamps, commands = read("/commands")
+    people = None if crowd is None else crowd.tracks(stamps)
     made, hidden = {}, {}
     for name, sensor in member.sensors.items():
         if sensor.schema:
@@ -325,7 +381,7 @@ def _assemble(world: World, member: Member, logs: _Logs, status: str) -> Recordi
         robot=member.robot.nominal,
         sensors=member.sensors,
         logs=made,
-        truth=Truth(stamps, poses, travel, {k: v for k, v in hidden.items() if v}, world),
+        truth=Truth(stamps, poses, travel, {k: v for k, v in hidden.items() if v}, world, people),
         commands=CommandLog(command_stamps, np.array(commands, float).reshape(-1, 2)),
         config=member.config,
         status=status,

@@ -2,15 +2,21 @@
 
 A beam that ends at distance d from the nearest wall has the likelihood
 
-    p(d) = z_hit N(d; 0, sigma^2) + z_rand / z_max,
+    p(d) = exp(-d^2 / (2 sigma^2)) + exp(-max_loss)
 
-looked up in a table over the floor. The table holds (log p(0) - log p(d)) / step in whole numbers
-of 16 bits, so that it stays in the processor's cache and a scan is a sum of integers.
+but for a factor, looked up in a table over the floor. The table holds (log p(0) - log p(d)) / step
+in whole numbers of 16 bits, so that it stays in the processor's cache and a scan is a sum of
+integers.
+
+The second term is what the map does not explain: people, furniture of another day, the unknown. It
+bounds what a beam can lose, so beams that end short at a crowd do not outweigh those that end at
+walls. It is a mixture of hits and random measurements (Thrun, Burgard, Fox 2005, Probabilistic
+Robotics, sec. 6.4), but its size does not follow from the laser's greatest range, and it is the
+same on either side of a wall: 1 / z_max where nothing is known (ibid.) is more than what free space
+has, and draws beams, and the robot with them, to the far side of the walls.
 
 On an occupancy grid d is the distance to the middle of the nearest occupied cell, and zero in such
-a cell. A beam that ends where nothing is known has at least the likelihood 1 / z_max, since all its
-ranges are equally likely there (Thrun, Burgard, Fox 2005, Probabilistic Robotics, sec. 6.4); off
-the grid nothing is known. Only free cells are floor.
+a cell. Only free cells are floor.
 """
 
 import math
@@ -67,9 +73,13 @@ class LikelihoodField:
         return bool(0.0 <= row < rows and 0.0 <= column < columns)
 
     def draw(self, n: int, rng: np.random.Generator) -> Array:
-        """Poses (n, 3), uniform over the free floor and all headings."""
+        """Poses (n, 3), uniform over the free floor, one in each nth of it, and over all headings.
+
+        Neighbours come in turn, so the processor's cache holds what their beams look up.
+        """
         require(len(self.free_cells) > 0, "the map has no free cells in which to place particles")
-        cells = self.free_cells[rng.integers(len(self.free_cells), size=n)]
+        rows = (np.arange(n) + rng.random(n)) * (len(self.free_cells) / n)
+        cells = self.free_cells[np.minimum(rows.astype(np.int64), len(self.free_cells) - 1)]
         places: Array = self.origin_m + (cells[:, ::-1] + rng.random((n, 2))) * self.cell_m
         return np.column_stack([places, rng.uniform(-math.pi, math.pi, n)])
 
@@ -96,12 +106,11 @@ class LikelihoodField:
 class FieldOptions:
     """Options of the beam model (likelihood field)."""
 
-    sigma_m: Positive = 0.2
+    sigma_m: Positive = 0.1
     """Spread of beam ends about the walls, m: range noise, half a cell, and errors of the map."""
-    z_hit: Positive = 0.9
-    """Share of beams that end at a wall."""
-    z_rand: Positive = 0.1
-    """Share of beams that end anywhere up to the laser's greatest range z_max."""
+    max_loss: Positive = 2.0
+    """Greatest loss in log likelihood of a beam that ends off the walls: at people, at furniture
+    that the map lacks, where nothing is known. AMCL's z_rand of 0.1 makes it 4 to 7."""
     cell_m: Positive = 0.05
     """Side of a cell, m."""
 
@@ -123,10 +132,9 @@ def likelihood_field(
     """
     walls, extent = _walls(known_map, laser)
     cell_m, sigma_m = believed.cell_m, believed.sigma_m
-    normal = believed.z_hit / (sigma_m * math.sqrt(2.0 * math.pi))
-    anywhere = believed.z_rand / laser.max_range_m
-    # Beyond this distance beams that hit are a thousandth of those that end anywhere
-    reach_m = sigma_m * math.sqrt(2.0 * math.log(max(1000.0 * normal / anywhere, math.e)))
+    floor_p = math.exp(-believed.max_loss)
+    # Beyond this distance hits are a thousandth of what the map does not explain
+    reach_m = sigma_m * math.sqrt(2.0 * (believed.max_loss + math.log(1000.0)))
     reach_m = max(reach_m, 2.0 * _CLEARANCE_M)
     with np.errstate(over="ignore", invalid="ignore"):  # counted in floats, which do not wrap
         origin = np.floor((extent.min(axis=0) - reach_m) / cell_m) * cell_m - cell_m
@@ -139,21 +147,19 @@ def likelihood_field(
     )
     columns, rows = sides.astype(int).tolist()
     distances = _distances(walls, origin, cell_m, reach_m, rows, columns)
-    p = normal * np.exp(-0.5 * np.square(distances / sigma_m)) + anywhere
+    p = np.exp(-0.5 * np.square(distances / sigma_m)) + floor_p
     floor = distances > _CLEARANCE_M
     if isinstance(known_map, OccupancyGrid):
         free, occupied = _states(known_map, origin, cell_m, rows, columns)
-        p[occupied] = normal + anywhere
-        unknown = ~(free | occupied)
-        p[unknown] = np.maximum(p[unknown], min(1.0 / laser.max_range_m, normal + anywhere))
+        p[occupied] = 1.0 + floor_p
         floor &= free
     else:
         margin = round(reach_m / cell_m) + 1
         within = np.zeros_like(floor)
         within[margin:-margin, margin:-margin] = True
         floor &= within  # the walls' rectangle
-    at_wall, step = math.log(normal + anywhere), math.log1p(normal / anywhere) / _MOST
-    table = np.round((at_wall - np.log(p)) / step).astype(np.uint16)
+    step = math.log1p(1.0 / floor_p) / _MOST
+    table = np.round((math.log1p(floor_p) - np.log(p)) / step).astype(np.uint16)
     return LikelihoodField(table, origin, cell_m, step, _largest(floor))
 
 

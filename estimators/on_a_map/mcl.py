@@ -4,13 +4,16 @@ Particles roll by the wheels, are weighted by a likelihood field, and are resamp
 follows the spread of the belief: as many as the bins of pose that they fall into call for (KLD
 sampling; Fox 2003).
 
-The filter may be lost, and two ways back are offered. `average`: when scans fit worse than their
-long-term average, particles are injected over all the floor (augmented MCL), drawn by the scan
-(sensor resetting). `rivals`: a set of particles drawn by a scan over all the floor, and as many
-drawn from the belief, follow the same wheels and scans for a while; if the best path of the rivals
-explains them better than the best of the defenders by a margin, the rivals become the belief.
-People before the laser and what the map lacks count against both alike, which an average over time
-mistakes for being lost.
+The likelihood of a beam is bounded (see `likelihood_field`), so people and moved furniture, which
+the map lacks, cannot outweigh the walls. It is wide while the belief is wide, and sharp after that.
+
+The filter may be lost, and two ways back are offered. `rivals`: a set of particles drawn by a scan
+over all the floor, and as many drawn from the belief, follow the same wheels and scans for a while;
+if the best path of the rivals explains them better than the best of the defenders by a margin, the
+rivals become the belief. People and what the map lacks count against both alike. `average`: when
+scans fit worse than their long-term average, particles are injected over all the floor (augmented
+MCL), drawn by the scan (sensor resetting). It takes people for being lost, and each of up to
+`max_particles` injected costs `tries` poses to draw.
 """
 
 import math
@@ -46,8 +49,8 @@ from sim.worlds.world import World
 
 Recovery = Literal["none", "average", "rivals"]
 
-_OFF_WALLS = 2.0  # what a beam of a contest loses, in log likelihood, by ending off the walls
 _BISECTIONS = 12
+_SAMPLED = 16  # one in so many poses tried on the floor decides by how much a scan counts there
 _MOST_PARTICLES, _MOST_TRIES = 10_000_000, 100_000_000  # 0.2 and 2 GB of poses
 _FARTHEST_M, _FARTHEST_RAD = 1.0, 0.5  # of what belongs to one hypothesis
 _MOST_BINS = 250_000_000  # 2 GB
@@ -101,7 +104,7 @@ class Bins:
 
     def count_particles(self, poses: Array) -> int:
         """Particles that the number of bins in use by poses (M, 3) calls for."""
-        k = np.count_nonzero(np.bincount(self.number(poses)))
+        k = len(np.unique(self.number(poses)))
         if k < 2:
             return 1
         a = 2.0 / (9.0 * (k - 1))
@@ -119,9 +122,13 @@ class MclOptions(WheelOptions, FieldOptions, BinOptions, LaserOptions):
     """Greatest number of particles, with which it starts."""
     n_beams: Count = 60
     """Beams of each scan that are used, evenly spaced."""
-    beam_power: Positive = 0.1
+    beam_power: Positive = 0.3
     """Each beam's likelihood is raised to this power, since neighbouring beams err together and
     particles are few for so sharp a likelihood; 1 for independent beams."""
+    search_sigma_m: Positive = 0.2
+    """The same while the belief calls for more than `min_particles`, and of poses drawn over the
+    floor: a sharp likelihood would pass between the particles (Pfaff, Burgard, Fox 2006, Robust
+    Monte-Carlo localization using adaptive likelihood models)."""
     min_ess: NonNegative = 0.4
     """A scan counts for less when it would leave less than this share of the particles; below
     `ess_share`."""
@@ -139,7 +146,7 @@ class MclOptions(WheelOptions, FieldOptions, BinOptions, LaserOptions):
     """Spread added to the place of each particle drawn, so that copies differ, m."""
     jitter_rad: NonNegative = 0.005
     """Spread added to the heading of each particle drawn, rad."""
-    recovery: Recovery = "average"
+    recovery: Recovery = "rivals"
     """Recovery from being lost: by the `average` of the fit over time, by `rivals` that see the
     same scans, or `none`."""
     alpha_slow: NonNegative = 0.01
@@ -183,9 +190,9 @@ class Mcl(MclOptions):
     -----
     `amcl_alphas` converts kr and kl for AMCL.
 
-    The defaults are for finding the robot anywhere: blunt likelihoods and a jitter that widens the
-    belief to twice its error or more. A tracker that knows its error wants beam_power=1,
-    min_ess=0, sigma_m of 0.05 to 0.1, and no jitter; it is consistent then.
+    The defaults find the robot anywhere and keep it among people; tempering and jitter make the
+    belief wider than its error. A tracker that knows its error wants beam_power=1, min_ess=0,
+    sigma_m of 0.05, and no jitter; it is consistent then.
 
     Without a start pose the particles are drawn by the first scan, and later ones are injected by
     the current one: along a corridor, where long beams fix the heading closely, a uniform draw
@@ -211,17 +218,8 @@ class Mcl(MclOptions):
         )
         self._wheels = WheelPrediction(self, prior.robot.track_m)
         self._field = likelihood_field(prior.map, self._laser, self)
-        if self.recovery == "rivals":
-            # off the walls every end is as unlikely: else beams that end short, at people, outweigh
-            # all others, and beams that end in the unknown are better than those
-            off_walls = math.exp(-_OFF_WALLS) * self._laser.max_range_m
-            blunt = FieldOptions(
-                cell_m=self.cell_m,
-                sigma_m=self.sigma_m,
-                z_hit=1.0,
-                z_rand=off_walls / (self.sigma_m * math.sqrt(2.0 * math.pi)),
-            )
-            self._bounded = likelihood_field(prior.map, self._laser, blunt)
+        wide = FieldOptions(sigma_m=self.search_sigma_m, max_loss=self.max_loss, cell_m=self.cell_m)
+        self._search_field = likelihood_field(prior.map, self._laser, wide)
         self._bins = Bins(self._field, self)
         self._off_map = prior.mean is not None and not self._field.holds(prior.mean)
         start, self._everywhere = prior.start, prior.start is None
@@ -279,11 +277,13 @@ class Mcl(MclOptions):
     def _weigh(self, ends: Floats) -> None:
         """Weight by one scan, sum up the belief, and resample if that is due."""
         if self._everywhere:
-            self._poses = self._drawn_by_scan(self.max_particles, ends, self._field)
+            self._poses = self._drawn_by_scan(self.max_particles, ends)
             self._everywhere = False
             self._belief = self._summed_up()
             return
-        of_scan = self._field.log_likelihood(self._poses, ends)
+        narrow = self._bins.count_particles(self._poses) <= self.min_particles
+        field = self._field if narrow else self._search_field
+        of_scan = field.log_likelihood(self._poses, ends)
         self._log_weights = self._weighed(of_scan)
         self._belief = self._summed_up()
         if self.recovery == "rivals" and self._yielded(ends):
@@ -293,20 +293,25 @@ class Mcl(MclOptions):
             self._draw(share, ends)
 
     def _weighed(self, of_scan: Array) -> Array:
-        """Log weights (M,) with a scan counted by `beam_power`, or by as much as `min_ess` lets.
+        """Log weights (M,) with a scan of log likelihoods (M,), counted as far as they bear it."""
+        least = min(self.min_ess * len(of_scan), effective_sample_size(self._log_weights))
+        power = self._power(self._log_weights, of_scan, least)
+        weights = self._log_weights + power * of_scan
+        return np.zeros(len(weights)) if have_underflowed(weights) else weights - np.max(weights)
+
+    def _power(self, log_weights: Array, of_scan: Array, least: float) -> float:
+        """Power of a scan's likelihood: `beam_power`, or what leaves an effective size of `least`.
 
         The effective sample size falls as the power grows, so the power is found by bisection.
         """
-        least = min(self.min_ess * len(of_scan), effective_sample_size(self._log_weights))
         low, high = 0.0, self.beam_power
-        weights = self._log_weights + high * of_scan
-        if effective_sample_size(weights) < least:
-            for _ in range(_BISECTIONS):
-                middle = (low + high) / 2.0
-                poor = effective_sample_size(self._log_weights + middle * of_scan) < least
-                low, high = (low, middle) if poor else (middle, high)
-            weights = self._log_weights + low * of_scan
-        return np.zeros(len(weights)) if have_underflowed(weights) else weights - np.max(weights)
+        if effective_sample_size(log_weights + high * of_scan) >= least:
+            return high
+        for _ in range(_BISECTIONS):
+            middle = (low + high) / 2.0
+            poor = effective_sample_size(log_weights + middle * of_scan) < least
+            low, high = (low, middle) if poor else (middle, high)
+        return low
 
     def _injected_share(self, of_scan: Array, n_beams: int) -> float:
         """Share of particles to inject: the short average of the fit against the long one.
@@ -331,15 +336,18 @@ class Mcl(MclOptions):
         n = self.n_rivals
         if self._contest is None:
             defenders = self._poses[resample(self._log_weights, n, self._rng, self.resampling)]
-            rivals = self._drawn_by_scan(n, ends, self._bounded)
+            rivals = self._drawn_by_scan(n, ends)
             self._contest = np.stack([self._jittered(defenders), rivals])
             self._explained, self._n_explained, self._n_contested = np.zeros((2, n)), 0, 0
             return False
         for side in (0, 1):
-            of_scan = self._bounded.log_likelihood(self._contest[side], ends)
-            drawn = resample(self.beam_power * of_scan, n, self._rng, self.resampling)
-            self._explained[side] = (self._explained[side] + of_scan)[drawn]
-            self._contest[side] = self._jittered(self._contest[side][drawn])
+            of_scan = self._search_field.log_likelihood(self._contest[side], ends)
+            power = self._power(np.zeros(n), of_scan, self.min_ess * n)
+            drawn = resample(power * of_scan, n, self._rng, self.resampling)
+            poses = self._contest[side][drawn]
+            sharp = self._field.log_likelihood(poses, ends)
+            self._explained[side] = self._explained[side][drawn] + sharp
+            self._contest[side] = self._jittered(poses)
         self._n_explained += ends.shape[1]
         self._n_contested += 1
         if self._n_contested < self.rival_scans:
@@ -359,11 +367,14 @@ class Mcl(MclOptions):
         moved: Array = poses + jitter * [self.jitter_m, self.jitter_m, self.jitter_rad]
         return moved
 
-    def _drawn_by_scan(self, n: int, ends: Floats, field: LikelihoodField) -> Array:
+    def _drawn_by_scan(self, n: int, ends: Floats) -> Array:
         """Poses (n, 3) over all the floor, drawn by how well the scan fits there."""
-        tries = field.draw(n * self.tries, self._rng)
-        log_weights = self.beam_power * field.log_likelihood(tries, ends)
-        return tries[resample(log_weights, n, self._rng, self.resampling)]
+        tries = self._field.draw(n * self.tries, self._rng)
+        of_scan = self._search_field.log_likelihood(tries, ends)
+        sample = of_scan[:: min(self.tries, _SAMPLED)]
+        least = self.min_ess * n * len(sample) / len(tries)
+        power = self._power(np.zeros(len(sample)), sample, least)
+        return tries[resample(power * of_scan, n, self._rng, self.resampling)]
 
     def _draw(self, injected_share: float, ends: Floats) -> None:
         """Resample to as many particles as the bins they fall into call for, and inject others."""
@@ -375,7 +386,7 @@ class Mcl(MclOptions):
             drawn = resample(self._log_weights, n - n_injected, self._rng, self.resampling)
             poses = self._poses[drawn]
             if n_injected > 0:
-                poses = np.concatenate([poses, self._drawn_by_scan(n_injected, ends, self._field)])
+                poses = np.concatenate([poses, self._drawn_by_scan(n_injected, ends)])
             needed = min(
                 max(self._bins.count_particles(poses), self.min_particles), self.max_particles
             )

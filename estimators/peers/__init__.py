@@ -3,7 +3,6 @@
 They work in three dimensions; poses and scans here are planar.
 """
 
-import importlib
 from typing import Any
 
 import numpy as np
@@ -28,7 +27,7 @@ def package(name: str, extra: str) -> Any:
         If it is not installed; naming the extra that brings it.
     """
     try:
-        return importlib.import_module(name)
+        return __import__(name, fromlist=["_"])  # which is seen by who records it
     except ImportError as error:
         raise MissingPackageError(
             f"{name} cannot be imported ({error}); pip install 'estima[{extra}]'"

@@ -12,8 +12,7 @@ from experiments.bench.measure import Measurement, median_time_s, time_s
 from experiments.runs import paths, store
 from experiments.runs.experiment import Experiment
 from experiments.runs.seeds import stream
-from experiments.sweeps.work import run_and_record
-from sim.team import Team
+from experiments.sweeps.work import Held, run_and_record
 
 _NAME = "bench_sweep"
 _SHORT = ["simulation.physics=kinematic", "simulation.rays=exact", "route=linear_1"]
@@ -48,7 +47,7 @@ def _overheads() -> Iterator[Measurement]:
     experiment = Experiment.compose([*_SHORT, f"name={_NAME}", "picture=false"])
     read = experiment.recordings()
     recording = read.only
-    _packed_s([experiment], {experiment.recording_key: read})
+    _packed_s([experiment], {experiment.recording_key: (read, {})})
     prior, estimator = experiment.prior(recording), experiment.estimator()
     own_s = median_time_s(
         lambda: run_estimator(estimator, recording, prior, stream(0, "bench")),
@@ -57,7 +56,7 @@ def _overheads() -> Iterator[Measurement]:
 
     def packed_s(repeats: int) -> float:
         many = experiment.with_values(repeats=repeats)
-        return _packed_s([many], {many.recording_key: read})
+        return _packed_s([many], {many.recording_key: (read, {})})
 
     def swept_s(n_runs: int) -> float:
         """Wall time of a sweep over values of a belief, the recording being cached."""
@@ -84,7 +83,7 @@ def _cheapest_run_ms() -> float:
     return 1e3 * _packed_s(runs[20:], {}) / len(runs[20:])
 
 
-def _packed_s(runs: Sequence[Experiment], held: dict[str, Team]) -> float:
+def _packed_s(runs: Sequence[Experiment], held: Held) -> float:
     """Processor time of runs in one job, their rows included."""
     begun = time.process_time()
     with store.journal(runs[0].rows_folder / f"bench{store.JOURNAL}") as journal:

@@ -88,6 +88,8 @@ _COMMANDS: dict[str, Callable[..., None]] = {  # as `estima --help` lists them
     "table": tables.table,
     "plot": tables.plot,
     "reproduce": project.reproduce,
+    "audit": project.audit,
+    "results": project.list_results,
     "report": tables.report,
     "cache": project.cache,
     "export-table": tables.export_table,

@@ -9,32 +9,87 @@ import typer
 
 from experiments.cli import completion
 from experiments.runs import paths
+from sim.errors import require
 
 
 def reproduce(
-    full: Annotated[bool, typer.Option("--full", help="The judged profile.")] = False,
-    paper: Annotated[str | None, typer.Option(help="Only this paper.")] = None,
+    full: Annotated[bool, typer.Option("--full", help="Make every row again.")] = False,
+    stale: Annotated[
+        bool, typer.Option("--stale", help="Make what is stale again, as `estima results` lists.")
+    ] = False,
+    paper: Annotated[str | None, typer.Option(help="Make only this paper or study again.")] = None,
     figures_only: Annotated[
         bool, typer.Option("--figures-only", help="Redraw the figures from the tables in results/.")
     ] = False,
+    minutes: Annotated[float, typer.Option(help="About how long the audit takes.")] = 2.0,
 ) -> None:
-    """Make the papers' figures, tables and claims, in results/quick/ or, in full, in results/.
+    """Check the judged results: audit them, redraw the figures, judge the claims; code 1 if not so.
+
+    With --full or --stale make them again, in results/; without, all goes to results/reproduced/.
 
     Examples
     --------
+      estima reproduce
+
       estima reproduce --paper puzzlebot2024
 
-      estima reproduce --full
-
-      estima reproduce --figures-only
+      estima reproduce --stale
     """
-    from experiments.reproduce import redraw
-    from experiments.reproduce import reproduce as reproduce_papers
+    from experiments import reproduce as made
 
+    require(
+        full + stale + figures_only <= 1, "--full, --stale and --figures-only: give one of them"
+    )
     if figures_only:
-        redraw(only=paper)
-    else:
-        reproduce_papers(full=full, only=paper)
+        made.redraw(only=paper)
+    elif stale:
+        made.renew(only=paper)
+    elif full or paper is not None:
+        made.reproduce(only=paper)
+    elif not made.check_results(minutes):
+        raise typer.Exit(1)
+
+
+def list_results() -> None:
+    """List every table, figure and verdict: fresh or stale, from which commit, at what cost.
+
+    Stale is what depends on a file, program or package that has changed since; unrecorded, what
+    does not say what it depends on.
+
+    Example: estima results
+    """
+    from experiments.judging.built import State, list_built
+
+    found = list_built(paths.results())
+    require(
+        bool(found), f"{paths.short(paths.results())}: no results here; estima reproduce --full"
+    )
+    for each in found:
+        print(each)
+    counts = [f"{sum(each.state is state for each in found)} {state}" for state in State]
+    print(", ".join(counts))
+
+
+def audit(
+    minutes: Annotated[float, typer.Option(help="About how long.")] = 2.0,
+    rows: Annotated[int | None, typer.Option(help="So many rows, however long.")] = None,
+    seed: Annotated[int, typer.Option(help="Of the draw.")] = 0,
+) -> None:
+    """Make rows of the judged tables again, drawn at random; code 1 if one differs.
+
+    Some are behind the headlines of the claims, the others are drawn evenly from all. Computing
+    times do not count. The last line says what share of all rows can differ.
+
+    Examples
+    --------
+      estima audit
+
+      estima audit --rows 200 --seed 7
+    """
+    from experiments.audit import audit as audit_tables
+
+    if not audit_tables(minutes, rows, seed):
+        raise typer.Exit(1)
 
 
 def bench(

@@ -16,7 +16,7 @@ import pandas as pd
 from experiments.judging.claim import Claim, Role, Verdict
 from experiments.judging.folders import findings
 from experiments.judging.region import region_columns
-from experiments.judging.results import Profile
+from experiments.judging.results import Profile, reproduce_command
 from experiments.judging.sentences import Conclusion
 from experiments.runs.row import read_rows, write_frame
 from experiments.runs.version import code_version, describe_machine
@@ -63,7 +63,7 @@ _TEXTS = {
 }
 FIRST_CRITERIA = date(2026, 11, 21)  # before any result was judged
 _ORIGIN = ("profile", "seconds", "code_version")
-_REMEDY = "restore it by `git checkout`, or delete it and run `estima reproduce`"
+_REMEDY = f"restore it by `git checkout`, or delete it and run `{reproduce_command(None)}`"
 
 
 def write_claims(

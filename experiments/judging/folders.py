@@ -1,11 +1,22 @@
 """Where the code of a paper or of a study of ours lies, and what it says of its findings."""
 
+import importlib
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from experiments.runs.paths import SOURCE
 from sim.yaml_file import read_yaml
 
+PAPERS = ("puzzlebot2024", "decristoforis2020", "maximo2024", "gil2008")
+LOGS = ("real_logs", "twins")  # run only where the logs are
+NAMED = ("teams", "exploration")  # judged, run when named
+OWN = (
+    "mcl_office",
+    "fastslam_consistency",
+    "peers",
+)  # our own, which judge no claim: run when named
+STUDIES = (*PAPERS, *LOGS, *NAMED, *OWN)
 ROOMS = tuple(SOURCE / "experiments" / room for room in ("papers", "studies"))
 
 
@@ -13,6 +24,11 @@ def code_folder(study: str) -> Path:
     """Folder of a paper's or a study's code, findings and settings; it need not exist."""
     folders = [room / study for room in ROOMS]
     return next((folder for folder in folders if folder.is_dir()), folders[0])
+
+
+def part(study: str, name: str) -> ModuleType:
+    """Return a module of a paper or study: `study`, `claims` or `figures`."""
+    return importlib.import_module(f"experiments.{code_folder(study).parent.name}.{study}.{name}")
 
 
 def findings(study: str) -> dict[str, Any]:

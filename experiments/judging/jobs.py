@@ -1,5 +1,6 @@
 """The jobs of a study: which runs go together, how all cores share them, and their tables."""
 
+import time
 from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping, Sequence
 from itertools import chain
 from typing import Any, TypeVar
@@ -9,6 +10,13 @@ import pandas as pd
 from joblib import Parallel, delayed
 from numpy.typing import ArrayLike
 
+from experiments.runs.dependencies.recorder import (
+    Digests,
+    is_recording,
+    note,
+    note_part,
+    recorded,
+)
 from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Row
@@ -35,11 +43,35 @@ def in_parallel(
     costs
         How long each job takes, in any unit; None if all take the same.
     """
+    for result, dependencies, _ in _recorded_jobs(function, jobs, on_progress, costs):
+        note(dependencies)
+        yield result
+
+
+def _recorded_jobs(
+    function: Callable[..., T],
+    jobs: Sequence[Sequence[Any]],
+    on_progress: Progress,
+    costs: ArrayLike | None,
+) -> Iterator[tuple[T, Digests, float]]:
+    """Yield results, what each depends on and the seconds that it took."""
     done = np.cumsum(np.ones(len(jobs)) if costs is None else costs)
-    results = Parallel(n_jobs=-1, return_as="generator")(delayed(function)(*job) for job in jobs)
+    calls = (delayed(_recorded_job)(function, job, is_recording()) for job in jobs)
+    results = Parallel(n_jobs=-1, return_as="generator")(calls)
     for share, result in zip(done / done[-1], results, strict=True):
         yield result
         on_progress(float(share))
+
+
+def _recorded_job(
+    function: Callable[..., T], job: Sequence[Any], wanted: bool
+) -> tuple[T, Digests, float]:
+    begun = time.monotonic()
+    if not wanted:
+        return function(*job), {}, time.monotonic() - begun
+    with recorded(function.__module__) as seen:
+        result = function(*job)
+    return result, seen.digests(), time.monotonic() - begun
 
 
 def tables_of(
@@ -50,9 +82,10 @@ def tables_of(
 ) -> dict[str, pd.DataFrame]:
     """Run jobs by `in_parallel` and join the rows that they give, by table, in their order."""
     parts: dict[str, list[Any]] = {}
-    for tables in in_parallel(function, jobs, on_progress, costs):
+    for tables, dependencies, seconds in _recorded_jobs(function, jobs, on_progress, costs):
         for name, rows in tables.items():
             parts.setdefault(name, []).append(rows)
+            note_part(name, dependencies, seconds)
     return {name: _joined(several) for name, several in parts.items()}
 
 

@@ -29,6 +29,11 @@ _MISFITS = (
 )
 
 
+def write_table(frame: pd.DataFrame, path: Path) -> None:
+    """Write a table of a study, its numbers with twelve digits."""
+    write_frame(frame, path, digits=12)
+
+
 class Profile(StrEnum):
     """The size of a study: `quick` makes every table and figure from few repeats."""
 
@@ -49,7 +54,7 @@ class Results:
     def write_tables(self, **frames: pd.DataFrame) -> None:
         """Write tables by name."""
         for name, frame in frames.items():
-            write_frame(frame, self._path("tables", f"{name}.csv"), digits=12)
+            write_table(frame, self._path("tables", f"{name}.csv"))
 
     def table(self, name: str) -> pd.DataFrame:
         """Read a table.
@@ -120,13 +125,12 @@ class Results:
 
     @property
     def _remedy(self) -> str:
-        return f"run `{reproduce_command(self.paper, full=self.folder.name != 'quick')}`"
+        return f"run `{reproduce_command(self.paper)}`"
 
 
-def reproduce_command(paper: str | None, *, full: bool) -> str:
-    """The command that makes a paper's results, or those of all papers."""
-    of_paper = f" --paper {paper}" if paper else ""
-    return f"estima reproduce{of_paper}{' --full' * full}"
+def reproduce_command(paper: str | None) -> str:
+    """The command that makes a paper's results again, or those of all papers."""
+    return f"estima reproduce{f' --paper {paper}' if paper else ''} --full"
 
 
 class _Arrays(Arrays):

@@ -40,12 +40,12 @@ OWN = {
     ],
     "peers": [
         "pip install 'estima[peers,tune]' && make peers",
-        reproduce_command("peers", full=True),
+        reproduce_command("peers"),
         "estima tune peers -o conf/estimator",
     ],
     "all_estimators": ["estima run -m study=all_estimators"],
-    "mcl_office": [reproduce_command("mcl_office", full=True)],
-    "fastslam_consistency": [reproduce_command("fastslam_consistency", full=True)],
+    "mcl_office": [reproduce_command("mcl_office")],
+    "fastslam_consistency": [reproduce_command("fastslam_consistency")],
 }
 FIRST = (
     "real_logs_building",
@@ -53,7 +53,7 @@ FIRST = (
 )  # pictures for the first screen, the best first
 SMALL_ROWS, SMALL_COLUMNS = 60, 20  # a table up to here is shown whole
 FIRST_ROWS = 5  # of a larger one
-_REMEDY = "restore it by `git checkout`, or delete it and run `estima reproduce`"
+_REMEDY = "restore it by `git checkout`, or delete it and run `estima reproduce --full`"
 
 
 def contents(results: Path, on_progress: Callable[[float], None]) -> dict[str, Any]:
@@ -64,7 +64,7 @@ def contents(results: Path, on_progress: Callable[[float], None]) -> dict[str, A
     about = {name: findings(name) for name in (*papers, *OWN)}
     verdicts = read_verdicts(results / "verdicts.csv").set_index("id")
     claims = judged_claims(table, about, verdicts)
-    commands = {name: [reproduce_command(name, full=True)] for name in papers} | OWN
+    commands = {name: [reproduce_command(name)] for name in papers} | OWN
     commands |= {str(k): list(v.unique()) for k, v in table.groupby("paper")["command"]}
     studies = {}
     for done, (name, page) in enumerate(about.items(), start=1):

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pandas as pd
 
+from experiments.judging.results import reproduce_command
 from experiments.report.page import write_report
 from experiments.report.plot import Size, sweep_figure
 from experiments.report.sweep_page import extremes, picture_path, write_sweep_page
@@ -104,7 +105,7 @@ def page_of_papers() -> Path:
     require(
         any((results / name).exists() for name in ("claims.csv", "figures", "tables")),
         f"{paths.short(results)}: no claims, figures or tables to report; "
-        "`estima reproduce` makes them, and `estima table NAME` shows a sweep",
+        f"`{reproduce_command(None)}` makes them, and `estima table NAME` shows a sweep",
     )
     with progress("report", 1.0) as on_progress:
         return write_report(results, on_progress)

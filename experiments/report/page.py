@@ -14,7 +14,7 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 
-from experiments.judging.results import Profile
+from experiments.judging.results import Profile, reproduce_command
 from experiments.report.contents import contents
 from experiments.report.export import plain, significant
 from experiments.runs.console import warn
@@ -38,7 +38,8 @@ def write_report(results: Path, on_progress: Callable[[float], None] = lambda _:
     if found["missing"]:
         warn(
             f"{results / 'claims.csv'}: no verdict on {', '.join(found['missing'])}, though others "
-            "of the paper have one; `git checkout results/claims.csv` or `estima reproduce`"
+            "of the paper have one; `git checkout results/claims.csv` or "
+            f"`{reproduce_command(None)}`"
         )
     path = results / "report.html"
     write_text(path, render("page.html", **found))

@@ -1,6 +1,7 @@
-"""A cache of recordings, addressed by a digest of their inputs: a sweep simulates each once.
+"""A cache of recordings, addressed by a digest of their settings: a sweep simulates each once.
 
-It holds at most $ESTIMA_CACHE_GIB (8 unless set); the least recently used go first.
+An entry says what else it depends on, and is made again when that has changed. The cache holds at
+most $ESTIMA_CACHE_GIB (8 unless set); the least recently used go first.
 """
 
 import dataclasses
@@ -13,6 +14,8 @@ from pathlib import Path
 
 from experiments.runs import paths
 from experiments.runs.console import warn
+from experiments.runs.dependencies.digests import changed
+from experiments.runs.dependencies.recorder import Digests, note
 from experiments.runs.processes import hold_lock
 from sim.errors import InputError, require
 from sim.files import require_file
@@ -21,7 +24,7 @@ from sim.recording import Recording, load, save
 _LIMIT_GIB = 8.0
 _TRIMS_PER_LIMIT = 64  # so often is the cache trimmed while as much is written as it holds
 _ABANDONED_S = 3600.0  # what is still half-written then, nobody writes
-_KEY = "cache_key"  # in the configuration that an entry holds
+_KEY, _DEPENDENCIES = "cache_key", "cache_dependencies"  # in the configuration of an entry
 
 
 def folder() -> Path:
@@ -29,11 +32,16 @@ def folder() -> Path:
     return paths.results() / "cache" / "recordings"
 
 
-def fetch_or_make(key: str, make: Callable[[], Recording]) -> Recording:
+def fetch_or_make(key: str, make: Callable[[], tuple[Recording, Digests]]) -> Recording:
     """Recording of the key, from the cache, or made now and cached.
 
     Safe with several processes: the second waits for the first and reads its file. A file that
     does not match its checksum, or holds the recording of another key, is dropped and made again.
+
+    Parameters
+    ----------
+    make
+        Makes the recording, and says what it depends on.
     """
     path = folder() / f"{key}.npz"
     limit = limit_bytes()
@@ -41,14 +49,19 @@ def fetch_or_make(key: str, make: Callable[[], Recording]) -> Recording:
         if path.exists():
             require_file(path)
             try:
-                recording = _entry(path, key)
-                os.utime(path)
-                return recording
+                recording, dependencies = _entry(path, key)
+                if not changed(dependencies):
+                    os.utime(path)
+                    note(dependencies)
+                    return recording
+                path.unlink(missing_ok=True)
             except InputError as error:
                 warn(f"estima: {error}; making it again")
                 path.unlink(missing_ok=True)
-        recording = make()
-        entry = dataclasses.replace(recording, config={**recording.config, _KEY: key})
+        recording, dependencies = make()
+        note(dependencies)
+        own = {_KEY: key, _DEPENDENCIES: dict(dependencies)}
+        entry = dataclasses.replace(recording, config={**recording.config, **own})
         save(entry, path, durable=False)
         size = path.stat().st_size
     draw = zlib.crc32(key.encode()) / 2**32  # from 0 to 1: trimming looks at every file
@@ -57,12 +70,14 @@ def fetch_or_make(key: str, make: Callable[[], Recording]) -> Recording:
     return recording
 
 
-def _entry(path: Path, key: str) -> Recording:
-    """Read a recording of the cache, which holds its own key, under its checksum."""
+def _entry(path: Path, key: str) -> tuple[Recording, Digests]:
+    """Read a recording of the cache, which holds its key and dependencies, under its checksum."""
     entry = load(path)
-    require(entry.config.get(_KEY) == key, f"{path}: the recording of another key")
-    settings = {name: value for name, value in entry.config.items() if name != _KEY}
-    return dataclasses.replace(entry, config=settings)
+    settings = dict(entry.config)
+    require(settings.pop(_KEY, None) == key, f"{path}: the recording of another key")
+    dependencies = settings.pop(_DEPENDENCIES, None)
+    require(isinstance(dependencies, dict), f"{path}: does not say what it depends on")
+    return dataclasses.replace(entry, config=settings), dependencies
 
 
 def limit_bytes() -> float:

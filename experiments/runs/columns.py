@@ -129,7 +129,8 @@ COLUMNS = {
 STATUS = ("status", "status_code", "status_detail")
 REPEAT = "repeat"  # counts the runs of an estimator over one recording
 ORIGIN = ("run_key", "code_version", "recording_checksum")
-_SETTINGS = ("seed", "world_seed", "repeats", "recording", "calibration", "name")
+DEPENDENCIES = "dependencies"  # digest of what a row depends on; see `experiments.runs.store`
+_SETTINGS = ("seed", "world_seed", "repeats", "isolated", "recording", "calibration", "name")
 
 
 def is_setting(name: str) -> bool:

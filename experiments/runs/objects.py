@@ -18,6 +18,7 @@ from experiments.evaluation.metrics import SCORED_EXTRAS
 from experiments.runs.cache import fetch_or_make
 from experiments.runs.calibration import read_calibration
 from experiments.runs.console import warn
+from experiments.runs.dependencies.recorder import Digests, note_unloaded, recorded
 from experiments.runs.key import recording_key
 from experiments.runs.schema import (
     SIMULATED_KEYS,
@@ -32,6 +33,7 @@ from experiments.runs.targets import make
 from sim.arrays import Array
 from sim.errors import InputError, blaming, require, required
 from sim.options import build
+from sim.people.walk import People
 from sim.recording import Frame, Recording
 from sim.robot.base import RobotGeometry, robot_from_config
 from sim.sensors import Sensor, Sensors, sensors_from_config
@@ -73,7 +75,7 @@ class Objects:
 
     @property
     def recording_key(self) -> str:
-        """Digest of what decides the recording's bits: its settings, or a file's; and the code."""
+        """Digest of the settings that decide the recording's bits, or of its file."""
         return recording_key(self.config)
 
     @property
@@ -100,6 +102,8 @@ class Objects:
         """Make the estimator: anything with `reset` and `step`."""
         settings = copy.deepcopy(self.config["estimator"])
         if self.isolated:
+            target = str(self.config["estimator"].get("_target_"))
+            note_unloaded(target.rpartition(".")[0], self.config["estimator"])
             return Isolated(settings, [*SCORED_EXTRAS, *self.config["keep"]])
         estimator: Estimator = self.own_estimator or make(settings, "estimator")
         for method in ("reset", "step"):
@@ -169,7 +173,11 @@ class Objects:
         simulation = dataclasses.asdict(
             build(SimulationOptions, self.config["simulation"], "simulation")
         )
-        return record_team(self.world(), members, **simulation, on_progress=on_progress)
+        people = build(People, self.config["people"], "people")
+        passers_by = people, stream(self.seed, "people")
+        return record_team(
+            self.world(), members, **simulation, passers_by=passers_by, on_progress=on_progress
+        )
 
     def simulate(
         self,
@@ -198,12 +206,20 @@ class Objects:
             return Team((self._calibrated(made),))
         if wanted is not None:
             return self._loaded(Path(wanted))
-        simulate = functools.cache(lambda: self.simulate_team(on_progress))
+
+        @functools.cache
+        def simulate() -> tuple[Team, Digests]:
+            with recorded(__name__) as seen:
+                team = self.simulate_team(on_progress)
+            return team, seen.digests()
+
+        def one(number: int) -> tuple[Recording, Digests]:
+            team, dependencies = simulate()
+            return team.robots[number], dependencies
 
         def of_robot(number: int) -> Recording:
-            found = fetch_or_make(
-                f"{self.recording_key}-{number}", lambda: simulate().robots[number]
-            )
+            key = f"{self.recording_key}-{number}"
+            found = fetch_or_make(key, functools.partial(one, number))
             # a file does not choose what code runs, but the configuration does
             return dataclasses.replace(found, sensors=self.of_robot(number).sensors())
 
@@ -255,7 +271,7 @@ class Objects:
     ) -> Callable[[Frame], Array]:
         """Start the estimator that the route's feedback names; it knows the start and the map."""
         estimator = self._steering()
-        prior = Prior(robot, sensors, start.copy(), np.zeros((3, 3)), world)
+        prior = Prior(robot, sensors, start.copy(), np.zeros((3, 3)), world.known)
         with blaming("route.feedback"):
             estimator.reset(prior, stream(self.config["seed"], "onboard"))
         return lambda frame: estimator.step(frame).mean

@@ -13,7 +13,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from experiments.runs.columns import ORIGIN, REPEAT, STATUS
+from experiments.runs.columns import DEPENDENCIES, ORIGIN, REPEAT, STATUS
 from sim.errors import InputError, printable, require
 from sim.files import require_file, write_whole
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 Row = dict[str, str | int | float | bool | None]
-_TEXTS = (*STATUS, *ORIGIN)
+_TEXTS = (*STATUS, *ORIGIN, DEPENDENCIES)
 _KEY = re.compile(r"[0-9A-Za-z_-]{1,64}")  # it becomes the name of files
 WITH_DIGEST = re.compile(r".+\.([0-9a-f]{16})\.parquet")
 GAP = "gap"  # the code of a run that gave no pose for some of the drive
@@ -81,7 +81,7 @@ def check_row(row: Row) -> None:
         If a value is not a scalar that a table can hold, the status is missing or unknown, the
         run's key is not a word, or a number is NaN though the status is ok.
     """
-    for key in _TEXTS:
+    for key in (*STATUS, *ORIGIN):
         require(isinstance(row.get(key), str), f"a row must have the text {key}")
     require(row["status"] in _OUTCOMES, f"a row's status is one of {', '.join(_OUTCOMES)}")
     require(

@@ -12,13 +12,14 @@ import numpy as np
 from estimators.base import Estimate
 from estimators.programs.program import ProgramError
 from experiments.runs import paths
-from experiments.runs.columns import COLUMNS, REVISED
+from experiments.runs.columns import COLUMNS, DEPENDENCIES, REVISED
 from experiments.runs.console import RunFailedError, progress, show, warn
+from experiments.runs.dependencies.recorder import recorded
 from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
 from experiments.runs.processes import hold_interrupts
 from experiments.runs.row import Outcome, Row
-from experiments.runs.store import write_run
+from experiments.runs.store import keep_dependencies, write_run
 from experiments.trajectories.convert import write_estimate
 from sim.errors import InputError, require
 from sim.recording import Recording
@@ -84,13 +85,16 @@ def run_once(experiment: Experiment, draw: Draw, out: Path | None = None) -> lis
 
                 yield update
 
-        rows = evaluate(
-            experiment,
-            fetch,
-            shown=lambda read: shown(name, sum(len(r.frame_stamps) for r in read.robots)),
-            on_estimate=keep,
-            on_error=_trace,
-        )
+        with recorded(evaluate.__module__) as seen:
+            rows = evaluate(
+                experiment,
+                fetch,
+                shown=lambda read: shown(name, sum(len(r.frame_stamps) for r in read.robots)),
+                on_estimate=keep,
+                on_error=_trace,
+            )
+    kept = keep_dependencies(seen.digests(), folder.parent)
+    rows = [row | {DEPENDENCIES: kept} for row in rows]
     written = (write_run(rows, folder.parent), folder / "run.png", out)
     if found and out is not None:
         write_estimate(out, found[0][1])

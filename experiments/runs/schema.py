@@ -17,12 +17,15 @@ from experiments.runs.paths import CONF
 from sim import sensors
 from sim.errors import InputError, describe_unknown, require
 from sim.options import Count, NonNegative, Option, Positive, described, find, options
+from sim.people.walk import People
 from sim.robot.drive import DifferentialDrive
 
 Config = dict[str, Any]
 Leaf = tuple[str, ...]  # a place in the configuration: ("robot", "kr")
 GROUPS = ("world", "robot", "sensors", "route", "estimator")
-SIMULATED_KEYS = ("world", "robot", "sensors", "route", "simulation", "seed", "world_seed")
+SIMULATED_KEYS = (
+    "world", "robot", "sensors", "route", "simulation", "people", "seed", "world_seed"
+)  # fmt: skip
 _OWN = ("robot", "sensors", "route")  # groups in which a robot of a team may differ
 _INJECTED = ("rng", "config", "recording")  # arguments that the program passes
 _UNSET = object()
@@ -111,9 +114,11 @@ class TeamSettings:
 
 OPTIONS: dict[str, type] = {
     "simulation": SimulationOptions,
+    "people": People,
     "prior": PriorOptions,
     "scoring": ScoringOptions,
 }
+_UNNAMED = {"robot": DifferentialDrive, "people": People}  # what takes keys without a _target_
 _MAPPINGS = (*GROUPS, *OPTIONS)
 KEYS = (*_MAPPINGS, "seed", "world_seed", "recording", "calibration", "name")
 RUN_KEYS = ("repeats", "keep", "picture", "isolated")  # of `RunOptions`
@@ -157,9 +162,10 @@ def with_leaf(tree: Mapping[str, Any], leaf: Leaf, value: Any) -> Config:
 def fill(cfg: DictConfig) -> None:
     """Give a composed configuration the defaults of what it names, where it does not state a key.
 
-    These are those of the robot, and of each `_target_` of a world, sensor, route and estimator.
+    These are those of the robot, the people, and each `_target_` of a world, sensor, route and
+    estimator.
     """
-    for place in _places(cfg, GROUPS):
+    for place in _places(cfg, (*GROUPS, "people")):
         settings = value_at(cfg, place)
         hidden = place == "estimator" and cfg.get("isolated") is True
         if isinstance(settings, DictConfig) and not (hidden and not is_ours(settings)):
@@ -189,8 +195,8 @@ def _places(cfg: DictConfig, groups: Iterable[str]) -> Iterator[str]:
 
 def _target(settings: DictConfig, place: str) -> Callable[..., Any]:
     """What takes the settings of a place."""
-    if place == "robot" and "_target_" not in settings:
-        return DifferentialDrive
+    if place in _UNNAMED and "_target_" not in settings:
+        return _UNNAMED[place]
     return find(value_at(settings, "_target_"), place)
 
 

@@ -27,7 +27,7 @@ from experiments.evaluation.time_sync import Rows, nearest_rows
 from experiments.runs.columns import OF_THE_RUN, REVISED
 from experiments.runs.evaluate import status_of_pauses
 from experiments.runs.experiment import rows_folder
-from experiments.runs.key import files_digest
+from experiments.runs.key import digest_of
 from experiments.runs.row import Outcome, Row, Status
 from experiments.runs.store import write_run
 from experiments.runs.version import code_version
@@ -185,8 +185,8 @@ def row_of(
     """
     settings = {f"trajectory.{key}": value for key, value in dataclasses.asdict(how).items()}
     del settings["trajectory.cpu_seconds"]
-    checksum, digests = recording.checksum, sorted(files_digest(str(files[1])).values())
-    origin = json.dumps([checksum, digests, settings, estimator])
+    checksum = recording.checksum
+    origin = json.dumps([checksum, _digests_of(files[1]), settings, estimator])
     status, seed = status_of_pauses(recording, scored.estimate.stamps), recording.config.get("seed")
     if status.outcome is Outcome.OK and scored.estimate.left_out:
         status = Status(Outcome.REMARK, "planar", scored.estimate.left_out)
@@ -291,3 +291,9 @@ def describe_scoring(scored: ScoredTrajectory, how: Scoring) -> str:
         f"  longest time without a pose: {scored.longest_gap_s:.3g} s\n"
         f"  {'revised' if how.revised else 'online'} path, {moved}{remark}"
     )
+
+
+def _digests_of(path: Path) -> list[str]:
+    """Digests of a file, or of the files in a folder."""
+    files = path.glob("*") if path.is_dir() else [path]
+    return sorted(digest_of(file) for file in files if file.is_file())

@@ -21,7 +21,9 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from experiments.runs.columns import REPEAT
+from experiments.runs.columns import DEPENDENCIES, REPEAT
+from experiments.runs.dependencies.digests import changed
+from experiments.runs.dependencies.recorder import Digests, digest_of_all
 from experiments.runs.processes import hold_lock
 from experiments.runs.row import (
     WITH_DIGEST,
@@ -34,6 +36,7 @@ from experiments.runs.row import (
     read_rows,
     to_tables,
 )
+from experiments.runs.version import code_version
 from sim.errors import InputError, require
 from sim.files import require_file, write_whole
 
@@ -47,8 +50,8 @@ JOURNAL = ".journal"
 _BEGUN, _WHOLE, _CHANGES, _FAILED = b"b=+!"
 ENDED = (_WHOLE, _CHANGES, _FAILED)  # kinds of lines of runs that have ended
 KIND_AT = 9  # place of the kind in a line, after the checksum
-_STATUS = ["run_key", "status", "status_code", "status_detail"]
-_KEY = re.compile("[0-9a-f]{16}")
+_STATUS = ["run_key", "status", "status_code", "status_detail", DEPENDENCIES, "code_version"]
+_KEY, _DIGEST = re.compile("[0-9a-f]{16}"), re.compile("[0-9a-f]{12}")
 _SMALL_BYTES, _MOST_SMALL = 2**22, 100  # small files are merged when there are more of them
 
 
@@ -127,7 +130,8 @@ class Outcomes:
 def read_runs(path: Path) -> pd.DataFrame:
     """Read a table, or all rows of a folder, each run once.
 
-    Of several rows of a run, those that did not fail are kept, else those of the last file.
+    Of several rows of a run and of equal dependencies, those that did not fail are kept, else
+    those of the last file.
 
     Raises
     ------
@@ -140,17 +144,17 @@ def read_runs(path: Path) -> pd.DataFrame:
     check_table(table, path)
     if not tables:
         return table
-    known = {"run_key", "status", REPEAT} <= set(table)
-    if not known or not table.duplicated(["run_key", REPEAT]).any():
+    run = [name for name in ("run_key", REPEAT, DEPENDENCIES) if name in table]
+    if "status" not in table or len(run) < 2 or not table.duplicated(run).any():
         return table
     source = np.repeat(np.arange(len(tables)), [len(t) for t in tables])
     sound = (table["status"] != Outcome.FAILED).groupby([table["run_key"], source])
     order = np.lexsort((source, sound.transform("all")))
-    return table.iloc[order].drop_duplicates(["run_key", REPEAT], keep="last", ignore_index=True)
+    return table.iloc[order].drop_duplicates(run, keep="last", ignore_index=True)
 
 
 def ended(folder: Path, prefix: str = "", damaged: Any = None) -> Outcomes:
-    """How the runs of a folder ended, by their status columns alone.
+    """How the runs of a folder ended, by their status columns alone; stale ones have not.
 
     Parameters
     ----------
@@ -169,13 +173,16 @@ def ended(folder: Path, prefix: str = "", damaged: Any = None) -> Outcomes:
             damaged(file, error)
             continue
         for table in tables:
-            if not set(_STATUS) <= set(table.column_names):
+            if not set(_STATUS) - {DEPENDENCIES} <= set(table.column_names):
                 continue
-            check_table(table.to_pandas(), file)
+            frame = table.to_pandas()
+            check_table(frame, file)
+            table = table.filter(fresh_rows(frame, folder))
             keys = _as_numbers(table["run_key"])
             bad = np.asarray(table["status"].to_pandas() == Outcome.FAILED.value)
             if bad.any():
-                codes, details = (table[c].to_pandas()[bad].fillna("") for c in _STATUS[2:])
+                said = ("status_code", "status_detail")
+                codes, details = (table[c].to_pandas()[bad].fillna("") for c in said)
                 failed.update(zip(keys[bad].tolist(), codes + ": " + details, strict=True))
                 keys = keys[~np.isin(keys, keys[bad])]
             done.append(keys)
@@ -184,6 +191,49 @@ def ended(folder: Path, prefix: str = "", damaged: Any = None) -> Outcomes:
     for key in places[np.isin(places, whole)].tolist():
         del failed[key]
     return Outcomes(whole, failed)
+
+
+def keep_dependencies(digests: Digests, folder: Path) -> str:
+    """Keep what rows depend on beside them; return its digest, which goes into the rows."""
+    digest = digest_of_all(digests)
+    path = _kept(folder, digest)
+    if not path.exists():
+        with write_whole(path, durable=False) as part:
+            part.write_text(json.dumps(digests, indent=1) + "\n")
+    return digest
+
+
+def stale_because(digest: str, folder: Path) -> list[str] | None:
+    """What has changed of the dependencies of rows in a folder; None if they are not known."""
+    path = _kept(folder, digest)
+    if not _DIGEST.fullmatch(digest):
+        return None
+    try:
+        require_file(path)
+        kept = json.loads(path.read_text())
+    except (OSError, ValueError, RecursionError):
+        return None
+    sound = isinstance(kept, dict) and digest_of_all(kept) == digest
+    return changed(kept) if sound else None
+
+
+def fresh_rows(table: pd.DataFrame, folder: Path) -> NDArray[np.bool_]:
+    """Which rows this code and the files here would make: none of their dependencies has changed.
+
+    Rows without known dependencies are taken for fresh if they come from this very code.
+    """
+    fresh = np.array(table["code_version"] == code_version())
+    if DEPENDENCIES in table:
+        digests = table[DEPENDENCIES].fillna("")
+        for digest in set(digests) - {""}:
+            why = stale_because(digest, folder)
+            if why is not None:
+                fresh[np.asarray(digests == digest)] = not why
+    return fresh
+
+
+def _kept(folder: Path, digest: str) -> Path:
+    return (folder if folder.is_dir() else folder.parent) / "dependencies" / f"{digest}.json"
 
 
 def find_begun_runs(folder: Path, prefix: str) -> set[int]:

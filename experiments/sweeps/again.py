@@ -16,7 +16,7 @@ from experiments.runs.columns import REPEAT, is_setting
 from experiments.runs.compose import find_option, open_composer, searched
 from experiments.runs.experiment import Experiment
 from experiments.runs.schema import GROUPS
-from experiments.runs.store import read_runs
+from experiments.runs.store import fresh_rows, read_runs
 from experiments.sweeps.collect import folder_of
 from experiments.sweeps.commands import noted_config_dir
 from experiments.viewing.estimates import OnStep, with_estimates_by
@@ -61,11 +61,13 @@ def row_of(word: str) -> pd.Series[Any] | None:
     Raises
     ------
     InputError
-        If the sweep has no such run, or several whose keys begin so.
+        If the sweep has no such run, or several whose keys begin so; or if code or files that it
+        depends on have changed.
     """
     path = Path(word)
     try:
-        rows = read_runs(folder_of(str(path.parent)))
+        folder = folder_of(str(path.parent))
+        rows = read_runs(folder)
     except InputError:
         return None
     key, _, repeat = path.name.partition(".")
@@ -73,6 +75,8 @@ def row_of(word: str) -> pd.Series[Any] | None:
         return None
     same = rows["run_key"].str.startswith(key) & (rows[REPEAT].astype(str) == (repeat or "0"))
     require(same.any(), f"{word}: the sweep {path.parent} has no such run")
+    same &= fresh_rows(rows, folder)
+    require(same.any(), f"{word}: it comes from another version of the code; run the sweep again")
     require(same.sum() == 1, f"{word}: {same.sum()} runs have keys that begin so; give more digits")
     return rows[same].iloc[0]
 
@@ -130,10 +134,6 @@ def run_of_row(
             f"the run had {name}={value}, and would have {mine} if it was made again",
         )
     again.check_estimator()  # without its module its version is another
-    require(
-        made["code_version"] == row["code_version"],
-        f"it comes from another version of the code, {row['code_version']}; run the sweep again",
-    )
     return RecordedRun(again, int(row[REPEAT]), str(row["recording_checksum"]))
 
 

@@ -12,6 +12,7 @@ import pandas as pd
 from experiments.runs.columns import (
     ANSWER,
     COLUMNS,
+    DEPENDENCIES,
     ORIGIN,
     PATH,
     REPEAT,
@@ -21,15 +22,14 @@ from experiments.runs.columns import (
 )
 from experiments.runs.console import pluralize, warn
 from experiments.runs.paths import results
-from experiments.runs.store import read_runs
-from experiments.runs.version import code_version, version_with
+from experiments.runs.store import fresh_rows, read_runs, stale_because
+from experiments.runs.version import code_version
 from experiments.sweeps.commands import MOST_BYTES
 from sim.errors import InputError, printable, require
 from sim.files import read_text
 
 FEW = 12  # colours, and panels
 _TIMES = ["step_time_us", "cpu_time_us"]  # they differ from run to run
-_COMMAND = "estimator.command"
 UNFINISHED = "unfinished-{}.txt"  # there until its sweep has ended: how many runs, and its command
 DRAWN = ("seed", "world_seed")  # settings that only draw other samples
 _NAMED = 12  # columns that a message names
@@ -61,16 +61,18 @@ def collect(name: str, *, all_versions: bool = False, times: bool = False) -> pd
         sound = column not in table or pd.api.types.is_string_dtype(table[column])
         require(sound, f"{path}: not rows of runs, column {column} is not text")
     if not all_versions:
-        mine = _of_this_code(table)
+        mine = fresh_rows(table, path)
+        why = "" if mine.all() else _why_stale(table[~mine], path)
         require(
             mine.any(),
-            f"{path}: all rows come from other versions of the code; run the sweep again, or see "
-            "them with those of all versions",
+            f"{path}: all rows come from other versions of the code{why}; run the sweep again, or "
+            "see them with those of all versions",
         )
         if not mine.all():
             left_out = pluralize((~mine).sum(), "row")
-            warn(f"left out {left_out} of other versions of the code")
-        table = table[mine]
+            warn(f"left out {left_out} of other versions of the code{why}")
+        table = table[mine].drop_duplicates(["run_key", REPEAT], keep="last")
+        table = table.assign(code_version=code_version())  # which would make the same
     for n_runs, command in unfinished_sweeps(path):
         here = pluralize(table["run_key"].nunique(), "run")
         words = f"{here} so far: the sweep of {n_runs} is unfinished; to go on: {command}"
@@ -79,7 +81,15 @@ def collect(name: str, *, all_versions: bool = False, times: bool = False) -> pd
     _check_distinct(table, settings, path)
     if not times:
         table = table.drop(columns=_TIMES, errors="ignore")
+    table = table.drop(columns=DEPENDENCIES, errors="ignore")
     return table.sort_values([*settings, "run_key", REPEAT], kind="stable", ignore_index=True)
+
+
+def _why_stale(table: pd.DataFrame, path: Path) -> str:
+    """What has changed since rows were made, as far as that is known."""
+    digests = set(table[DEPENDENCIES].dropna()) if DEPENDENCIES in table else set[str]()
+    names = sorted({name for d in digests for name in stale_because(d, path) or ()})
+    return f" ({first_names(names)} changed)" if names else ""
 
 
 def unfinished_sweeps(folder: Path) -> list[tuple[str, str]]:
@@ -149,32 +159,6 @@ def where(table: pd.DataFrame, conditions: Sequence[str]) -> pd.DataFrame:
             raise InputError(f"condition {condition}: no such row; there are {there}")
         table = table[meets]
     return table
-
-
-def _of_this_code(table: pd.DataFrame) -> pd.Series[bool]:
-    """Which rows come from this version of the code, and of estimators from elsewhere.
-
-    Raises
-    ------
-    InputError
-        If there are rows of several versions of a file that cannot be found here.
-    """
-    mine = table["code_version"].str.partition("+")[0] == code_version()
-    table = table if _COMMAND in table else table.assign(**{_COMMAND: None})
-    targets = [column for column in table if str(column).endswith("_target_")]
-    others = table[mine & table["code_version"].str.contains("+", regex=False)]
-    by = [*targets, _COMMAND]
-    for (*names, command), rows in others.groupby(by, dropna=False) if len(others) else ():
-        given = [name for name in names if isinstance(name, str)]
-        here = version_with(given, command)
-        if "+" in here:
-            mine[rows.index] = rows["code_version"] == here
-        elif rows["code_version"].nunique() > 1:
-            raise InputError(
-                f"rows of several versions of one of {', '.join(given)}, whose source is not "
-                "found; set PYTHONPATH to it, or keep all versions"
-            )
-    return mine
 
 
 def swept_settings(table: pd.DataFrame) -> list[str]:

@@ -32,7 +32,7 @@ from experiments.runs.compose import (
     set_value,
 )
 from experiments.runs.experiment import Experiment
-from experiments.runs.key import decides_recording, files_of_options, leaf_digests
+from experiments.runs.key import decides_recording, leaf_digests
 from experiments.runs.schema import Leaf, leaves, value_at
 from sim.errors import InputError, require
 
@@ -395,7 +395,7 @@ def _composed(
     for key in was_leaf if following is not None else ():
         leaf = tuple(key.split("."))
         of_key = (leaf, *(following or {}).get(leaf, ()))
-        if not any(_decides_more(leaf, values[key]) for leaf in of_key):
+        if not any(map(_decides_more, of_key)):
             axes[key] = Axis(of_key, values[key])
     return found, axes
 
@@ -426,16 +426,9 @@ def _following(tree: Any) -> dict[Leaf, list[Leaf]] | None:
     return found
 
 
-def _decides_more(leaf: Leaf, values: Sequence[Any]) -> bool:
-    """Whether a leaf decides more than its own value: a file, code, or how rays are cast."""
-    if leaf[0] == "estimator" or leaf[:2] == ("route", "feedback"):
-        options = [] if isinstance(values, range) else list(values)
-        return leaf[-1] in ("_target_", "command") or bool(files_of_options(options))
-    files = leaf[0] in ("recording", "calibration") or leaf[:2] in (
-        ("prior", "map"),
-        ("world", "path"),
-    )
-    return files or leaf[0] == "simulation" or leaf[-1] in ("_target_", "path")
+def _decides_more(leaf: Leaf) -> bool:
+    """Whether a leaf decides more than its own value: a recording, code, or how rays are cast."""
+    return leaf[0] in ("recording", "simulation") or leaf[-1] in ("_target_", "command")
 
 
 def _sums(first: str, steps: Sequence[Digests]) -> Digests:

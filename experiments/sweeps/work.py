@@ -13,6 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from experiments.runs import store
+from experiments.runs.columns import DEPENDENCIES
+from experiments.runs.dependencies.recorder import Digests, note, recorded
 from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
 from experiments.runs.processes import hold_interrupts, is_interrupt
@@ -20,6 +22,7 @@ from experiments.runs.row import Row, Status, check_row
 from experiments.sweeps.plan import Family
 from sim.team import Team
 
+Held = dict[str, tuple[Team, Digests]]
 _PR_SET_PDEATHSIG = 1  # of Linux
 
 
@@ -38,7 +41,7 @@ def run_share(share: Mapping[str, Any]) -> None:
 
     A run that fails leaves its row, and the next follows.
     """
-    held: dict[str, Team] = {}
+    held: Held = {}
     path = Path(share["journal"])
     over = store.ended(path.parent, f"{path.stem}.")  # something if the launcher tries it again
     keys = {*over.done.tolist(), *over.failed}
@@ -71,26 +74,29 @@ def end_with(node: str, planner: int) -> None:
         threading.Thread(target=watch, name="planner", daemon=True).start()
 
 
-def run_and_record(experiment: Experiment, held: dict[str, Team], journal: store.Journal) -> None:
+def run_and_record(experiment: Experiment, held: Held, journal: store.Journal) -> None:
     """Run one experiment; what goes wrong becomes the status of its row.
 
     Parameters
     ----------
     held
-        The last recording by its key; most runs of a job share it.
+        The last recording by its key, and what it depends on; most runs of a job share it.
     journal
-        Takes the rows.
+        Takes the rows; what they depend on is kept beside it.
     """
     journal.begin(experiment.key)
     with hold_interrupts() as on_step:  # what one causes is not a result
         try:
-            rows = evaluate(
-                experiment,
-                lambda: _held(experiment, held, on_step),
-                shown=lambda _: nullcontext(on_step),
-            )
+            with recorded(evaluate.__module__) as seen:
+                rows = evaluate(
+                    experiment,
+                    lambda: _held(experiment, held, on_step),
+                    shown=lambda _: nullcontext(on_step),
+                )
             for row in rows:
                 check_row(row)
+            kept = store.keep_dependencies(seen.digests(), journal.path.parent)
+            rows = [row | {DEPENDENCIES: kept} for row in rows]
         except BaseException as error:
             if is_interrupt(error):
                 raise
@@ -98,12 +104,16 @@ def run_and_record(experiment: Experiment, held: dict[str, Team], journal: store
     journal.append(rows)
 
 
-def _held(experiment: Experiment, held: dict[str, Team], on_progress: Callable[..., None]) -> Team:
+def _held(experiment: Experiment, held: Held, on_progress: Callable[..., None]) -> Team:
     key = experiment.recording_key
     if key not in held:
         held.clear()
-        held[key] = experiment.recordings(on_progress)
-    return held[key]
+        with recorded() as seen:
+            team = experiment.recordings(on_progress)
+        held[key] = team, seen.digests()
+    team, dependencies = held[key]
+    note(dependencies)
+    return team
 
 
 def failure_row(experiment: Experiment, status: Status) -> Row:

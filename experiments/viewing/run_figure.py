@@ -28,7 +28,13 @@ from experiments.viewing.team_figure import (
     path_width,
     sightings,
 )
-from experiments.viewing.world import draw_world, drawable, points_in_base, sees_landmarks
+from experiments.viewing.world import (
+    draw_people,
+    draw_world,
+    drawable,
+    points_in_base,
+    sees_landmarks,
+)
 from sim import se2
 from sim.arrays import Array
 from sim.recording import Recording
@@ -89,6 +95,7 @@ def _figure_alone(recording: Recording, estimate: Estimate, name: str) -> Figure
         draw_world(map_axes, recording.world, landmarks=sees_landmarks(recording))
     if recording.truth is not None:
         truth = recording.truth_at(estimate.stamps)
+        draw_people(map_axes, recording.truth)
         map_axes.plot(*truth[:, :2].T, color=TRUTH, lw=1.6, label="truth")
         _draw_errors(halves[1].subplots(3, 1, sharex=True), estimate, truth)
     means = estimate.means

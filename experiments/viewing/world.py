@@ -22,7 +22,7 @@ from experiments.viewing.style import (
     subplots,
 )
 from sim.arrays import Array
-from sim.recording import Recording
+from sim.recording import Recording, Truth
 from sim.worlds.world import World
 
 _PLACES = {
@@ -63,6 +63,8 @@ def draw_world(
             for j, (x1, y1, x2, y2) in enumerate(rectangles):
                 label = name.replace("_", ", ") if j == 0 else ""
                 ax.add_patch(Rectangle((x1, y1), x2 - x1, y2 - y1, label=label, **style))
+    if world.known is not world:
+        draw_walls(ax, world.known.walls, world.known.wall_z_m, color=ORANGE, alpha=0.6)
     draw_walls(ax, world.walls, world.wall_z_m)
     if landmarks and len(world.landmarks):
         twin = world.look_alike if len(world.look_alike) else np.zeros(len(world.landmarks), bool)
@@ -72,6 +74,14 @@ def draw_world(
     if tour and len(world.waypoints):
         ax.plot(*world.waypoints.T, color=BLUE, lw=1.0, label="tour")
         ax.plot(*world.start_pose[:2], "o", color=BLUE, ms=4, label="start")
+
+
+def draw_people(ax: Axes, truth: Truth) -> None:
+    """Draw the tracks of people who walk about."""
+    tracks = np.zeros((0, 0, 3)) if truth.people is None else truth.people
+    for person in range(tracks.shape[1]):
+        label = "people" if person == 0 else ""
+        ax.plot(*tracks[:, person, :2].T, color=SKY, lw=0.6, alpha=0.7, label=label)
 
 
 def draw_walls(ax: Axes, walls: Array, wall_z_m: Array, **style: Any) -> None:

@@ -140,8 +140,12 @@ class BulletBody(contextlib.AbstractContextManager["BulletBody"]):
         1 where nothing stops it. Rays pass through the robot, and through the ground unless
         `ground`.
         """
+        return self.strike(starts, ends, ground=ground)[0]
+
+    def strike(self, starts: Array, ends: Array, *, ground: bool = False) -> tuple[Array, Array]:
+        """Shares (N,) as of `cast`, and the normals (N, 3) of what stops the rays."""
         mask = _WALLS | _GROUND if ground else _WALLS
-        shares = np.empty(len(starts))
+        shares, normals = np.empty(len(starts)), np.empty((len(starts), 3))
         for first in range(0, len(starts), MAX_RAYS):
             rows = slice(first, first + MAX_RAYS)
             hits = pybullet.rayTestBatch(
@@ -152,7 +156,8 @@ class BulletBody(contextlib.AbstractContextManager["BulletBody"]):
                 physicsClientId=self._client,
             )
             shares[rows] = [hit[2] for hit in hits]
-        return shares
+            normals[rows] = [hit[4] for hit in hits]
+        return shares, normals
 
     def _surface(self, body: int, link: int, friction: float, group: int, mask: int) -> None:
         """Friction of a link, and what it collides with."""

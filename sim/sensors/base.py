@@ -17,12 +17,12 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from keyword import iskeyword
-from typing import Any, ClassVar, Protocol, TypeVar
+from typing import Any, ClassVar, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
 from sim import se2
-from sim.arrays import Array, Bools, Values
+from sim.arrays import Array, Bools, Ints, Values
 from sim.errors import InputError, blaming, require
 from sim.options import build, find, options
 from sim.worlds.world import World
@@ -144,6 +144,29 @@ def split_schema(schema: Schema) -> tuple[Schema, Schema]:
     return seen, {name: field for name, field in schema.items() if field.truth}
 
 
+class Hits(NamedTuple):
+    """What the beams of a scan hit.
+
+    Attributes
+    ----------
+    ranges_m
+        (B,); inf without a return.
+    cos_incidence
+        (B,) cosine of the angle between beam and the face's normal.
+    materials
+        (B,) `sim.worlds.world.Material`.
+    """
+
+    ranges_m: Array
+    cos_incidence: Array
+    materials: Ints
+
+    def nearer(self, other: "Hits") -> "Hits":
+        """Of two scans, what each beam hits first."""
+        first = self.ranges_m <= other.ranges_m
+        return Hits(*(np.where(first, a, b) for a, b in zip(self, other, strict=True)))
+
+
 class Rays(Protocol):
     """What casts rays in the world; scanners are on the robot at a pose (3,) in map."""
 
@@ -155,6 +178,9 @@ class Rays(Protocol):
 
     def sees(self, origin: Array, points: Array) -> Bools:
         """Whether nothing stands between a point (3,) and each of others (K, 3)."""
+
+    def hits(self, scanner: Any, eyes: Array, bearings_rad: Array, stamps: Array) -> Hits:
+        """What beams (B,) hit, each with its own pose of the scanner (B, 3), bearing and time."""
 
 
 @dataclass(frozen=True)
@@ -173,6 +199,8 @@ class View:
         The same sensor's firing before; the present one at the first.
     others
         Of a team: the pose (3,) of each other robot, by its number.
+    past
+        Stamps (T,) s and poses (T, 3) of base_link over the last moments, up to now.
     """
 
     stamp: float
@@ -182,6 +210,7 @@ class View:
     last_stamp: float
     last_pose: Array
     others: Mapping[int, Array] = field(default_factory=dict)
+    past: tuple[Array, Array] | None = None
 
     @property
     def duration_s(self) -> float:
@@ -196,9 +225,27 @@ class View:
     def scan(self, scanner: Any) -> Array:
         """True ranges (beams,) m of a planar scanner; +inf without a return.
 
-        It has `mount`, evenly spaced `bearings_rad` (beams,), and `max_range_m`.
+        It has `mount`, evenly spaced `bearings_rad` (beams,), and `max_range_m`; `sweep_s` if its
+        beams are measured one after another.
         """
+        if getattr(scanner, "sweep_s", 0.0) > 0.0:
+            return self.hits(scanner).ranges_m
         return self.rays.scan(scanner, self.pose)
+
+    def hits(self, scanner: Any, turned_rad: float = 0.0) -> Hits:
+        """What the beams of a `Laser` hit, each at its own instant, all turned by an angle."""
+        stamps = self.stamp + scanner.beam_offsets_s
+        poses = np.tile(self.pose, (len(stamps), 1))
+        if scanner.sweep_s > 0.0 and self.past is not None:
+            times, past = self.past
+            columns = (past[:, 0], past[:, 1], np.unwrap(past[:, 2]))
+            poses = np.stack([np.interp(stamps, times, column) for column in columns], axis=1)
+        mount = scanner.mount
+        eyes = np.column_stack(
+            [se2.transform(poses, np.tile([mount.x_m, mount.y_m], (len(poses), 1, 1)))[:, 0],
+             poses[:, 2] + mount.yaw_rad]
+        )  # fmt: skip
+        return self.rays.hits(scanner, eyes, scanner.bearings_rad + turned_rad, stamps)
 
     def cloud(self, lidar: Any) -> Array:
         """True ranges (rings, azimuths) m of a lidar like `Lidar3D`; +inf without a return."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import zlib
+from collections import deque
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -56,7 +57,10 @@ def probes(
     first: View,
     others: Callable[[], Mapping[int, Array]],
 ) -> dict[str, Firing]:
-    """Every sensor at work, from its first view on; `others` gives the poses of other robots."""
+    """Every sensor at work, from its first view on; `others` gives the poses of other robots.
+
+    A sensor whose beams are measured one after another keeps the poses since the first of them.
+    """
     found = {}
     for name, sensor in in_noise_order(sensors).items():
         own = rng if name in _SHARE_NOISE else _stream_of(rng, name)
@@ -84,16 +88,31 @@ class Firing:
     ) -> None:
         self._where, self._schema, self._last = f"sensors.{name}", sensor.schema, first
         self._others = others
+        self._past = deque([(first.stamp, first.pose)], maxlen=2 + math.ceil(
+            TICKS_PER_S * -float(np.min(getattr(sensor, "beam_offsets_s", 0.0)))
+        ))  # fmt: skip
         with blaming(self._where):
             self._probe = sensor.start(rng)
             if hasattr(self._probe, "begin"):
                 self._probe.begin(first)
         require(callable(self._probe), f"{self._where}: start must return a function of the view")
 
+    @property
+    def sweeps(self) -> bool:
+        """Whether its readings take time."""
+        return self._past.maxlen != 2
+
+    def follow(self, stamp: float, pose: Array) -> None:
+        """Remember the robot's pose (3,) at a tick, s."""
+        self._past.append((stamp, pose))
+
     def __call__(self, stamp: float, pose: Array) -> Reading | None:
         """Reading at a time, s, and the robot's pose (3,); None if it gives none."""
         last, others = self._last, self._others()
-        self._last = View(stamp, pose, last.world, last.rays, last.stamp, last.pose, others)
+        past = None
+        if self.sweeps:
+            past = np.array([time for time, _ in self._past]), np.array([p for _, p in self._past])
+        self._last = View(stamp, pose, last.world, last.rays, last.stamp, last.pose, others, past)
         with blaming(self._where):
             reading = self._probe(self._last)
         if reading is None:

@@ -22,7 +22,7 @@ class Laser:
     ros_topic: ClassVar = "/scan"
 
     rate_hz: Positive = 10.0
-    """Scans per second; a scan is taken at one instant."""
+    """Scans per second."""
     n_beams: Beams = 721
     fov_rad: Annotated[float, Bound(gt=0.0, le=2.0 * math.pi)] = math.pi
     """Angle between the first and the last beam."""
@@ -32,6 +32,12 @@ class Laser:
     """Returns beyond are +inf."""
     sigma_range_m: NonNegative = 0.01
     """Standard deviation of the Gaussian range noise."""
+    sweep_s: NonNegative = 0.0
+    """Time from the first beam of a pass to its last, s; 0: a scan is taken at one instant. The
+    stamp is that of the last beam."""
+    interlaced: Annotated[int, Bound(ge=1, le=100)] = 1
+    """Passes of the mirror over which the beams of a sweep are spread, evenly over a scan: of n,
+    each measures every n-th beam (SICK's quarter degree takes four, of a degree each)."""
     mount: Mount = Mount()
     """Where it sits on the robot."""
 
@@ -45,6 +51,16 @@ class Laser:
             return np.zeros(1)
         full = self.fov_rad > 2.0 * math.pi - 1e-9
         return np.linspace(-self.fov_rad / 2, self.fov_rad / 2, self.n_beams, endpoint=not full)
+
+    @property
+    def beam_offsets_s(self) -> Array:
+        """When each beam (n_beams,) is measured, s after the scan's stamp: zero or negative."""
+        beam = np.arange(self.n_beams)
+        if self.sweep_s == 0.0:
+            return np.zeros(self.n_beams)
+        times = self.sweep_s * beam / max(self.n_beams - 1, 1)
+        times += beam % self.interlaced / (self.interlaced * self.rate_hz)
+        return np.asarray(times - times.max())
 
     @property
     def schema(self) -> Schema:

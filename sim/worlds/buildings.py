@@ -24,8 +24,11 @@ from sim.worlds.floor_plan import (
     check_margins,
     rectangle_corners,
 )
+from sim.worlds.furnished import FurnishedOptions
 from sim.worlds.grid_file import read_grid
+from sim.worlds.grid_tour import plan_tour
 from sim.worlds.town import lawn, terrace, town
+from sim.worlds.vary import Shares, vary
 from sim.worlds.world import World, facing_second
 from sim.worlds.world_file import check_tour, read_world
 
@@ -45,7 +48,11 @@ def from_file(*, rng: np.random.Generator, path: str) -> World:
 
 
 def from_grid(
-    *, rng: np.random.Generator, path: str | None = None, waypoints: Sequence[list[float]] = ()
+    *,
+    rng: np.random.Generator,
+    path: str | None = None,
+    waypoints: Sequence[list[float]] = (),
+    stops: int = 0,
 ) -> World:
     """Draw a world from an occupancy grid: a wall along each border of its occupied cells.
 
@@ -55,11 +62,14 @@ def from_grid(
         The grid's YAML file; see `sim.worlds.grid_file`.
     waypoints
         [[x, y], ...] m: the tour. A grid has none of its own, so the route needs way-points if
-        these are fewer than two.
+        these are fewer than two and `stops` is 0.
+    stops
+        Places, drawn at random, of a tour that is planned if there are no way-points; 2 or more, or
+        0 for none.
     """
-    del rng
     path = required(path, "world.path must name a grid's .yaml, such as one `estima map` wrote")
-    walls = read_grid(path).walls()
+    grid = read_grid(path)
+    walls = grid.walls()
     require(
         len(walls) <= _MOST_GRID_WALLS,
         f"{path}: {len(walls)} walls, and {_MOST_GRID_WALLS} are the most; clean the grid, or "
@@ -69,6 +79,9 @@ def from_grid(
         tour = np.array(waypoints, float).reshape(-1, 2)
     except (TypeError, ValueError):
         raise InputError(f"world.waypoints must be points [x, y], m, got {waypoints!r}") from None
+    require(stops == 0 or stops >= 2, f"world.stops must be 0, or 2 or more, got {stops}")
+    if len(tour) == 0 and stops:
+        tour = plan_tour(grid, stops, rng)
     check_tour(tour, walls, Path(path))
     return World(
         name=Path(path).stem,
@@ -87,6 +100,7 @@ def room(
     n_objects: int = 6,
     n_landmarks: int = 60,
     look_alike_share: float = 0.0,
+    changed_share: float = 0.0,
 ) -> World:
     """Build one furnished room; the tour goes round it, 1.2 m off the walls."""
     check_margins(length_m=length_m - 3.0, width_m=width_m - 3.0)
@@ -96,7 +110,8 @@ def room(
     a, b = 1.2, (length_m - 1.2, width_m - 1.2)
     plan.tour = [(a, a), (b[0], a), (b[0], b[1]), (a, b[1]), (a, a)]
     plan.furnish(rng, (0, 0), (length_m, width_m), n_objects, size_m=(0.3, 1.0), clearance_m=0.45)
-    return plan.world("room", rng, n_landmarks=n_landmarks, look_alike_share=look_alike_share)
+    world = plan.world("room", rng, n_landmarks=n_landmarks, look_alike_share=look_alike_share)
+    return vary(plan, world, rng, Shares(changed_share))
 
 
 def boxes(
@@ -106,6 +121,7 @@ def boxes(
     side_m: float = 20.0,
     n_landmarks: int = 0,
     look_alike_share: float = 0.0,
+    changed_share: float = 0.0,
 ) -> World:
     """Scatter boxes in a square hall; the tour runs along its walls."""
     check_margins(side_m=side_m - 3.0)
@@ -114,11 +130,12 @@ def boxes(
     a, b = 1.2, side_m - 1.2
     plan.tour = [(a, a), (b, a), (b, b), (a, b), (a, a)]
     plan.furnish(rng, (0, 0), (side_m, side_m), n_boxes, clearance_m=0.5)
-    return plan.world("boxes", rng, n_landmarks=n_landmarks, look_alike_share=look_alike_share)
+    world = plan.world("boxes", rng, n_landmarks=n_landmarks, look_alike_share=look_alike_share)
+    return vary(plan, world, rng, Shares(changed_share))
 
 
 @options("world")
-class Rooms:
+class Rooms(FurnishedOptions):
     """n_x by n_y square rooms with a door between all neighbours.
 
     The tour goes from room to room: round the outer ring, then, where there is one, round the
@@ -133,8 +150,6 @@ class Rooms:
     n_landmarks: NonNegativeInt = 200
     on_walls_share: Share = 0.7
     """Share of the landmarks on walls; the others are on objects."""
-    look_alike_share: Share = 0.0
-    """Share of the landmarks that look like another one."""
 
     def __post_init__(self) -> None:
         require(
@@ -162,17 +177,11 @@ class Rooms:
         plan.tour = [((i + 0.5) * room_m, (j + 0.5) * room_m) for i, j in _grid_tour(n_x, n_y)]
         for low in corners:
             plan.furnish(rng, low, np.add(low, room_m).tolist(), self.objects_per_room)
-        return plan.world(
-            "rooms",
-            rng,
-            n_landmarks=self.n_landmarks,
-            on_walls_share=self.on_walls_share,
-            look_alike_share=self.look_alike_share,
-        )
+        return self.finish(plan, "rooms", rng, self.on_walls_share)
 
 
 @options("world")
-class Corridor:
+class Corridor(FurnishedOptions):
     """A bare stretch, objects, a bare stretch, a sharp bend, a leg, a round curve, a leg.
 
     Both turn left. The place `corridor_bare` stops 3 m short of the end wall and of the objects,
@@ -190,8 +199,6 @@ class Corridor:
     width_m: float = 2.2
     n_objects: NonNegativeInt = 8
     n_landmarks: NonNegativeInt = 80
-    look_alike_share: Share = 0.0
-    """Share of the landmarks that look like another one."""
 
     def __post_init__(self) -> None:
         check_margins(
@@ -230,19 +237,21 @@ class Corridor:
         middle = [(float(x), float(y)) for x, y in centre + r * arc]
         plan.tour = [(1.0, w / 2), (xc, w / 2), *middle, (far + 1.0, top + r)]
         _line_up(plan, rng, (x1, 0), (end, w), self.n_objects)
-        return plan.world(
-            "corridor",
-            rng,
-            n_landmarks=self.n_landmarks,
-            look_alike_share=self.look_alike_share,
-        )
+        return self.finish(plan, "corridor", rng)
 
 
-def corridors(*, rng: np.random.Generator, n_objects: list[int], **lengths_m: list[float]) -> World:
+def corridors(
+    *,
+    rng: np.random.Generator,
+    n_objects: list[int],
+    changed_share: float = 0.0,
+    **lengths_m: list[float],
+) -> World:
     """Build a `Corridor` whose sizes are drawn, each between the two ends given."""
     drawn = {name: rng.uniform(ends[0], ends[1]) for name, ends in lengths_m.items()}
     count = int(rng.integers(n_objects[0], n_objects[1] + 1))
-    return build(Corridor, {**drawn, "n_objects": count, "n_landmarks": 0}, "world").build(rng)
+    own = {"n_objects": count, "n_landmarks": 0, "changed_share": changed_share}
+    return build(Corridor, {**drawn, **own}, "world").build(rng)
 
 
 def office(
@@ -253,6 +262,8 @@ def office(
     look_alike_share: float = 0.1,
     objects_per_room: int = 5,
     rooms_visited: int = 8,
+    changed_share: float = 0.0,
+    doors_share: float = 0.0,
 ) -> World:
     """Build an office floor of 66 x 42 m: 22 furnished rooms on two corridor loops.
 
@@ -301,7 +312,8 @@ def office(
         _line_up(plan, rng, low, high, 7, keep_off=doors)
     for room in rooms:
         plan.furnish(rng, room.low, room.high, objects_per_room, size_m=(0.4, 1.6))
-    return plan.world("office", rng, n_landmarks=n_landmarks, look_alike_share=look_alike_share)
+    world = plan.world("office", rng, n_landmarks=n_landmarks, look_alike_share=look_alike_share)
+    return vary(plan, world, rng, Shares(changed_share, doors=doors_share))
 
 
 def streets(

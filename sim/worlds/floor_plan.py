@@ -1,7 +1,7 @@
 """A plan on which builders draw: walls, boxes, doors, objects clear of the tour, landmarks."""
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -12,6 +12,7 @@ from sim.worlds.world import World, facing_second
 
 WALL_HEIGHT_M = 2.5
 DESCRIPTOR_SIZE = 128
+CHORD_ERROR_M = 1e-4  # between a polygon and what is round
 _MOST_CELLS, _MOST_LANDMARKS = 2_500, 1_000_000  # of a world
 _APART_M = 0.12  # between furniture and walls, and among furniture
 _PROUD_M = 0.01  # landmarks stand this far off their face, so that rays see them from its side
@@ -25,6 +26,8 @@ class Plan:
     ----------
     faces, heights, on_object
         x1, y1, x2, y2 of each face; its bottom and top; whether it belongs to an object.
+    objects
+        First row of the faces of each object, and the row after its last.
     floors
         Outlines of the ground one can stand on; none drawn means everywhere.
     solids
@@ -36,17 +39,21 @@ class Plan:
     approaches
         x1, y1, x2, y2 of stretches that furniture keeps clear besides the tour: the ways
         through the doors.
+    doorways
+        x1, y1, x2, y2 of the gaps in walls.
     """
 
     faces: list[tuple[float, ...]] = field(default_factory=list)
     heights: list[tuple[float, float]] = field(default_factory=list)
     on_object: list[bool] = field(default_factory=list)
+    objects: list[tuple[int, int]] = field(default_factory=list)
     floors: list[Array] = field(default_factory=list)
     solids: list[tuple[Array, float]] = field(default_factory=list)
     discs: list[tuple[float, float, float]] = field(default_factory=list)
     places: dict[str, list[tuple[float, float, float, float]]] = field(default_factory=dict)
     tour: list[tuple[float, float]] = field(default_factory=list)
     approaches: list[tuple[float, ...]] = field(default_factory=list)
+    doorways: list[tuple[float, ...]] = field(default_factory=list)
 
     def wall(
         self,
@@ -65,6 +72,9 @@ class Plan:
             if low - begin > 1e-6:
                 a, b = np.asarray(start) + begin * unit, np.asarray(start) + low * unit
                 self._face((a[0], a[1], b[0], b[1]), (0.0, top_m), on_object=False)
+            if high > low:
+                a, b = np.asarray(start) + low * unit, np.asarray(start) + high * unit
+                self.doorways.append((*a.tolist(), *b.tolist()))
             begin = max(begin, high)
 
     def enclosure(self, corners: ArrayLike) -> None:
@@ -85,10 +95,22 @@ class Plan:
         self.place("door", x - 0.6, y - 0.6, x + 0.6, y + 0.6)
 
     def prism(
-        self, corners: ArrayLike, bottom_m: float, top_m: float, *, on_object: bool = True
+        self,
+        corners: ArrayLike,
+        bottom_m: float,
+        top_m: float,
+        *,
+        on_object: bool = True,
+        joined: bool = False,
     ) -> None:
-        """Draw the faces of an upright prism over corners (N, 2), counter-clockwise."""
+        """Draw the faces of an upright prism over corners (N, 2), counter-clockwise.
+
+        One that is `joined` belongs to the object drawn before, as the legs of a table do.
+        """
         ring = np.asarray(corners, float)
+        if on_object:
+            first = self.objects.pop()[0] if joined else len(self.faces)
+            self.objects.append((first, len(self.faces) + len(ring)))
         for (x1, y1), (x2, y2) in zip(ring, np.roll(ring, -1, axis=0), strict=True):
             self._face((x1, y1, x2, y2), (bottom_m, top_m), on_object=on_object)
         self.close(ring, top_m)
@@ -127,19 +149,55 @@ class Plan:
         InputError
             If so many do not fit.
         """
+
+        def outline(rng: np.random.Generator) -> Array:
+            size = rng.uniform(*size_m, size=2)
+            yaw = rng.uniform(0.0, math.pi) if rng.random() < 0.6 else 0.0
+            return box_corners((0.0, 0.0), size, yaw)
+
+        def draw(corners: Array, rng: np.random.Generator) -> None:
+            self.prism(corners, 0.0, rng.uniform(*height_m))
+
+        self.put(rng, (low, high), count, outline, draw, clearance_m=clearance_m, tries=tries)
+
+    def put(
+        self,
+        rng: np.random.Generator,
+        area: tuple[ArrayLike, ArrayLike],
+        count: int,
+        outline: Callable[[np.random.Generator], Array],
+        draw: Callable[[Array, np.random.Generator], None],
+        *,
+        clearance_m: float,
+        tries: int = 600,
+    ) -> None:
+        """Put `count` objects into a rectangle from its low to its high corner, as `furnish` does.
+
+        Parameters
+        ----------
+        outline
+            Gives the corners (N, 2) of a convex outline about the origin, counter-clockwise.
+        draw
+            Draws what stands within an outline (N, 2).
+
+        Raises
+        ------
+        InputError
+            If so many do not fit.
+        """
         require(count >= 0, f"world: the number of objects must be zero or more, got {count}")
-        least, most = np.array(low, float), np.array(high, float)
+        least, most = np.array(area[0], float), np.array(area[1], float)
         paths = _near(self._paths(), least - clearance_m, most + clearance_m)
         faces = _near(np.array(self.faces, float).reshape(-1, 4), least, most)
         for placed in range(count):
             for _ in range(tries):
-                size = rng.uniform(*size_m, size=2)
-                yaw = rng.uniform(0.0, math.pi) if rng.random() < 0.6 else 0.0
-                corners = box_corners(rng.uniform(least, most).tolist(), size, yaw)
+                corners = outline(rng)
+                corners = corners + rng.uniform(least, most)
                 within = np.all((corners > least + _APART_M) & (corners < most - _APART_M))
                 if within and self._fits(corners, faces, paths, clearance_m):
-                    self.prism(corners, 0.0, rng.uniform(*height_m))
-                    faces = np.vstack([faces, self.faces[-4:]])
+                    draw(corners, rng)
+                    edges = np.hstack([corners, np.roll(corners, -1, axis=0)])
+                    faces = np.vstack([faces, edges])
                     break
             else:
                 width, depth = most - least
@@ -151,7 +209,7 @@ class Plan:
     def tree(self, x: float, y: float, trunk_m: float, crown_m: float, top_m: float) -> None:
         """Draw a tree: a trunk, and a crown from 2.2 m up."""
         self.prism(regular((x, y), trunk_m, 6), 0.0, 2.2)
-        self.prism(regular((x, y), crown_m, 8), 2.2, top_m)
+        self.prism(regular((x, y), crown_m, 8), 2.2, top_m, joined=True)
 
     def world(
         self,
@@ -188,6 +246,9 @@ class Plan:
     def _fits(self, corners: Array, faces: Array, paths: Array, clearance_m: float) -> bool:
         """Whether a convex object keeps off faces, paths and the other objects."""
         edges = np.hstack([corners, np.roll(corners, -1, axis=0)])
+        lowest, highest = corners.min(axis=0), corners.max(axis=0)
+        paths = _near(paths, lowest - clearance_m, highest + clearance_m)
+        faces = _near(faces, lowest - _APART_M, highest + _APART_M)
         if len(paths) and gaps_m(edges, paths).min() < clearance_m:
             return False
         if len(faces) and gaps_m(edges, faces).min() < _APART_M:
@@ -256,7 +317,7 @@ class Plan:
         return free
 
 
-def rectangle_corners(low: Sequence[float], high: Sequence[float]) -> Array:
+def rectangle_corners(low: Sequence[float] | Array, high: Sequence[float] | Array) -> Array:
     """Corners (4, 2), m, counter-clockwise."""
     return np.array([(low[0], low[1]), (high[0], low[1]), (high[0], high[1]), (low[0], high[1])])
 
@@ -316,17 +377,40 @@ def _mean_area(rectangles: Array) -> float:
     return float(np.mean(np.prod(rectangles[:, 2:] - rectangles[:, :2], axis=1)))
 
 
-def box_corners(centre: Sequence[float], size: Sequence[float] | Array, yaw_rad: float) -> Array:
+def box_corners(
+    centre: Sequence[float] | Array, size: Sequence[float] | Array, yaw_rad: float
+) -> Array:
     """Corners (4, 2), m, counter-clockwise."""
     half = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * np.asarray(size) / 2
     cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
     return np.asarray(half @ np.array([[cos, sin], [-sin, cos]]) + np.asarray(centre))
 
 
-def regular(centre: Sequence[float], radius_m: float, sides: int) -> Array:
+def regular(centre: Sequence[float] | Array, radius_m: float, sides: int) -> Array:
     """Corners (sides, 2) of a regular polygon, m, counter-clockwise."""
     angle = 2.0 * math.pi * np.arange(sides) / sides
     return np.asarray(centre) + radius_m * np.stack([np.cos(angle), np.sin(angle)], 1)
+
+
+def arc_step_rad(radius_m: float) -> float:
+    """Angle between corners on an arc whose chords are off it by less than 0.1 mm."""
+    return 2.0 * math.acos(max(1.0 - 0.95 * CHORD_ERROR_M / radius_m, 0.0))
+
+
+def round_corners(centre: Sequence[float] | Array, radius_m: float) -> Array:
+    """Corners (N, 2), m, counter-clockwise, of something round: chords err by less than 0.1 mm."""
+    return regular(centre, radius_m, max(math.ceil(2.0 * math.pi / arc_step_rad(radius_m)), 8))
+
+
+def arc_points(
+    centre: Sequence[float] | Array, radius_m: float, ends_rad: Sequence[float]
+) -> Array:
+    """Points (N, 2), m, on an arc between two angles, ends included."""
+    sweep = abs(ends_rad[1] - ends_rad[0])
+    angle = np.linspace(
+        ends_rad[0], ends_rad[1], max(math.ceil(sweep / arc_step_rad(radius_m)), 1) + 1
+    )
+    return np.asarray(centre) + radius_m * np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
 def make_descriptors(

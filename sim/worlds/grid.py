@@ -121,7 +121,7 @@ def check_size(rows: float, columns: float, what: str, remedy: str) -> None:
 
 def of_world(recording: Recording, resolution_m: float, z_m: float) -> OccupancyGrid:
     """Grid of the walls of a recording's world, for `prior.map`; see `rasterized`."""
-    return rasterize(recording.known_world, resolution_m, z_m)
+    return rasterize(recording.known_world.known, resolution_m, z_m)
 
 
 def rasterize(world: World, resolution_m: float, z_m: float) -> OccupancyGrid:
@@ -148,13 +148,7 @@ def rasterize(world: World, resolution_m: float, z_m: float) -> OccupancyGrid:
     corner = (np.floor(ends.min(axis=0) / resolution_m) - 2.0) * resolution_m
     columns, rows = np.ceil((ends.max(axis=0) - corner) / resolution_m) + 2.0
     check_size(rows, columns, f"world {world.name}", "make resolution_m larger")
-    occupied = np.zeros((int(rows), int(columns)), bool)
-    for x1, y1, x2, y2 in walls:
-        steps = math.ceil(8.0 * math.hypot(x2 - x1, y2 - y1) / resolution_m)
-        on_wall = np.linspace((x1, y1), (x2, y2), steps + 1) - corner
-        for beside in np.array([[-1, -1], [1, -1], [-1, 1], [1, 1]]) / 4.0:
-            column, row = (on_wall / resolution_m + beside).astype(np.int64).T
-            occupied[row, column] = True
+    occupied = mark_walls(walls, corner, resolution_m, (int(rows), int(columns)))
     floors, _ = ndimage.label(~occupied)
     starts = np.concatenate([world.start_pose[None, :2], world.waypoints])
     places = np.floor((starts - corner) / resolution_m).astype(np.int64)
@@ -169,3 +163,15 @@ def rasterize(world: World, resolution_m: float, z_m: float) -> OccupancyGrid:
     probability[np.isin(floors, reached)] = 0.0
     probability[occupied] = 1.0
     return OccupancyGrid(probability, resolution_m, np.array([*corner, 0.0]))
+
+
+def mark_walls(walls: Array, corner: Array, resolution_m: float, shape: tuple[int, int]) -> Bools:
+    """Cells (rows, columns) within a quarter of a cell of walls (W, 4) m; `corner` is theirs."""
+    occupied = np.zeros(shape, bool)
+    for x1, y1, x2, y2 in walls:
+        steps = math.ceil(8.0 * math.hypot(x2 - x1, y2 - y1) / resolution_m)
+        on_wall = np.linspace((x1, y1), (x2, y2), steps + 1) - corner
+        for beside in np.array([[-1, -1], [1, -1], [-1, 1], [1, 1]]) / 4.0:
+            column, row = (on_wall / resolution_m + beside).astype(np.int64).T
+            occupied[row, column] = True
+    return occupied

@@ -4,12 +4,27 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
+from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.arrays import Array, Bools, Floats
+from sim.arrays import Array, Bools, Floats, Ints
 from sim.errors import InputError, require
+
+
+class Material(IntEnum):
+    """What a face is made of, as a laser sees it."""
+
+    PLASTER = 0
+    GLASS = 1
+    DARK = 2
+
+
+REMISSION = {Material.PLASTER: 0.8, Material.GLASS: 0.8, Material.DARK: 0.024}
+"""Share of the light that comes back at right angles: plaster, glass met so that it mirrors, and
+black foam rubber (SICK, LMS5xx operating instructions, 2021, sec. 3.6.4: plaster about 100 %, black
+foam rubber 2.4 %; paint takes a fifth)."""
 
 
 def facing_second(waypoints: Array) -> Array:
@@ -45,6 +60,13 @@ class World:
         (3,) m, m, rad: where a robot starts unless its route says otherwise.
     waypoints
         (P, 2) m: a tour through free space that passes every kind of place.
+    known_walls, known_wall_z_m
+        (K, 4) and (K, 2) m: faces of the map of another day, which estimators get; None where
+        nothing has changed since. Landmarks are as they are driven past.
+    materials
+        (W,) `Material` of each face; None where all are plaster.
+    doors
+        (D, 4) m: feet of doors that open and close, as they are when closed; None without any.
     """
 
     name: str
@@ -56,6 +78,10 @@ class World:
     places: dict[str, Array] = field(default_factory=dict)
     start_pose: Array = field(default_factory=lambda: np.zeros(3))
     waypoints: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    known_walls: Array | None = None
+    known_wall_z_m: Array | None = None
+    materials: Ints | None = None
+    doors: Array | None = None
 
     def __post_init__(self) -> None:
         shapes = {
@@ -66,6 +92,11 @@ class World:
             "waypoints": (self.waypoints, (len(self.waypoints), 2)),
             **{f"places.{k}": (v, (len(v), 4)) for k, v in self.places.items()},
         }
+        if self.doors is not None:
+            shapes["doors"] = self.doors, (len(self.doors), 4)
+        if self.known_walls is not None and self.known_wall_z_m is not None:
+            shapes["known_walls"] = self.known_walls, (len(self.known_walls), 4)
+            shapes["known_wall_z_m"] = self.known_wall_z_m, (len(self.known_walls), 2)
         for key, (values, shape) in shapes.items():
             require(
                 np.shape(values) == shape,
@@ -83,10 +114,40 @@ class World:
             f"world {self.name}: its L = {len(self.landmarks)} landmarks need descriptors of shape "
             "(L, D) and look_alike of shape (L,)",
         )
+        if self.materials is not None:
+            require(
+                np.shape(self.materials) == (len(self.walls),)
+                and np.isin(self.materials, [*Material]).all(),
+                f"world {self.name}: materials must be numbers of Material, one a wall",
+            )
+        require(
+            (self.known_walls is None) == (self.known_wall_z_m is None),
+            f"world {self.name}: known_walls and known_wall_z_m go together",
+        )
         for bad in np.flatnonzero(np.hypot(*(self.walls[:, 2:] - self.walls[:, :2]).T) < 1e-6):
             raise InputError(f"world {self.name}: wall {bad} has no length; give it two ends")
         for bad in np.flatnonzero(self.wall_z_m[:, 0] >= self.wall_z_m[:, 1]):
             raise InputError(f"world {self.name}: wall {bad} has its top below its bottom")
+
+    @property
+    def known(self) -> World:
+        """The world as its map has it, which may be of another day."""
+        if self.known_walls is None or self.known_wall_z_m is None:
+            return self
+        return replace(
+            self,
+            walls=self.known_walls,
+            wall_z_m=self.known_wall_z_m,
+            known_walls=None,
+            known_wall_z_m=None,
+            materials=None,
+        )
+
+    def material_of(self, faces: Bools) -> Ints:
+        """Materials (N,) of the faces of a mask (W,)."""
+        if self.materials is None:
+            return np.zeros(int(faces.sum()), np.int64)
+        return self.materials[faces]
 
     @property
     def bounds_m(self) -> Array:
@@ -103,8 +164,17 @@ class World:
         return np.concatenate([points.min(axis=0), points.max(axis=0)])
 
     def as_map(self) -> World:
-        """Return what a map shows of the world: neither where a robot starts, nor its tour."""
-        return replace(self, start_pose=np.zeros(3), waypoints=np.zeros((0, 2)))
+        """Return what a map shows of the world: neither where a robot starts, nor its tour.
+
+        Nor does it show what has changed since, of what walls are made, and doors.
+        """
+        return replace(
+            self.known,
+            start_pose=np.zeros(3),
+            waypoints=np.zeros((0, 2)),
+            materials=None,
+            doors=None,
+        )
 
     def place_of(self, points_in_world: Array) -> NDArray[np.str_]:
         """Name of the first place that holds each point (N, 2), or an empty string."""

@@ -49,6 +49,7 @@ def test_no_global_randomness_and_no_eval(path):
 ROOMS = (
     "cli",
     "reproduce",
+    "audit",
     "papers",
     "studies",
     "gate",

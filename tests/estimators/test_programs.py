@@ -21,7 +21,6 @@ from experiments.gate.suite import read_suite, run_suite
 from experiments.runs.evaluate import evaluate, run_over
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Outcome
-from experiments.runs.version import version_with
 from sim.errors import InputError
 from sim.recording import load, save
 from sim.worlds.grid import rasterize
@@ -444,19 +443,6 @@ def test_the_suite_of_a_cpp_program_runs(tmp_path, monkeypatch):
     rows = run_suite(suite, {"my_odometry": 1}, n_jobs=1)
     assert rows["status"].tolist() == ["ok"]
     assert 0.0 < rows["ate_rmse_m"][0] < 1.0
-
-
-def test_an_edited_program_is_another_version(tmp_path):
-    command = child(tmp_path, "print('{}', flush=True)")
-    settings = ["simulation.physics=kinematic", "route=linear_1", "estimator=external"]
-    experiment = Experiment.compose(settings).with_estimator(command=command)
-    version, key = experiment.labels("c")["code_version"], experiment.key
-    assert version == version_with([], json.dumps(command))  # as a row has it
-    child(tmp_path, "print('{ }', flush=True)")
-    assert experiment.labels("c")["code_version"] != version
-    assert experiment.key != key
-    assert "+" not in version_with([], None)
-    assert "+" not in version_with([], "python3 'open")
 
 
 def test_no_seed_or_cache_is_in_the_environment(recording, tmp_path, monkeypatch):

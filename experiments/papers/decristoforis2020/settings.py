@@ -5,6 +5,7 @@ RATE_HZ = 75.0  # of the laser as printed, at which DC1 and DC6 are judged
 PAPERS_OWN = ("odometry", "icp", "fusion")
 CHECKED = (*PAPERS_OWN, "fusion_clone")  # also run at other rates, rays and noise
 N_DRIVES, N_GEOMETRIES = 40, 20  # of DC1 and DC6; of DC2 to DC5
+N_REPEATS = 60  # registrations of each pair of scans
 NEES_AT_M = (5.0, 20.0, 50.0, 95.0)
 CONSISTENT = (0.8, 1.25)  # NEES over its degrees of freedom
 PLACES = {  # where pairs of scans are taken: study, and place of its world

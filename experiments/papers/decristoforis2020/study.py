@@ -28,6 +28,7 @@ from experiments.evaluation.metrics import (
 from experiments.evaluation.registration_errors import METRICS, measure, sample_scenes
 from experiments.judging.jobs import Progress, Tables, group_by, tables_of
 from experiments.judging.logs import DATA
+from experiments.judging.remake import Cells, Remake
 from experiments.judging.results import Profile, Results
 from experiments.papers.decristoforis2020.claims import judged_runs
 from experiments.papers.decristoforis2020.settings import (
@@ -35,6 +36,7 @@ from experiments.papers.decristoforis2020.settings import (
     JUDGED_SEED,
     N_DRIVES,
     N_GEOMETRIES,
+    N_REPEATS,
     NEES_AT_M,
     PAIRS,
     PAPERS_OWN,
@@ -131,7 +133,11 @@ def _jobs(full: bool, out: Results) -> list[Job]:
         *((0.5 * drive, _scored, ["process_noise", _ADJUSTED, group]) for group in adjusted),
         (0.2, _closeup, [first, out]),
         *((0.2, _closeup, [group]) for group in others),
-        *((0.1, _scenes, [seed, place, 60 if full else 6]) for seed in seeds for place in PLACES),
+        *(
+            (0.1, _scenes, [seed, place, N_REPEATS if full else 6])
+            for seed in seeds
+            for place in PLACES
+        ),
         *(
             (0.005, _metrics, [seed, kind])
             for seed in range(JUDGED_SEED, JUDGED_SEED + 5 * n)
@@ -142,6 +148,35 @@ def _jobs(full: bool, out: Results) -> list[Job]:
             for group in _planned("ordering", 5 if full else 1, *noise, *short)
         ),
     ]
+
+
+REMADE = {
+    "runs": 25.0,
+    "steps": 25.0,
+    "covariances": 3.0,
+    "ellipses": 3.5,
+    "beliefs": 10.0,
+    "ordering": 2.0,
+    "metrics": 0.1,
+}  # not pooled errors, and what only figures show
+
+
+def remake(table: str, row: Cells) -> Remake:
+    """The call that makes a row again."""
+    seed = f"{row.get('seed', 0):.0f}"
+    if table == "covariances":
+        return _scenes, (int(seed), row["place"], N_REPEATS)
+    if table == "metrics":
+        return _metrics, (int(seed), row["class"])
+    study, label, function, named = _RUN_BY[table]
+    given = [f"seed={seed}", *(f"{key}={row[name]:g}" for name, key in named.items())]
+    if row.get("rays") == "bullet":
+        given += ["simulation.physics=bullet", "simulation.rays=bullet"]
+    runs = plan_experiments([f"study=decristoforis2020/{study}", *given])
+    method = row.get(label, "icp")  # whose steps are in the table of steps
+    group = [one for one in runs if one.label(label) == method]
+    origin = {"beliefs": _BELIEF, "ordering": _NOISE}.get(table)
+    return function, (group,) if origin is None else (table, origin, group)
 
 
 def _planned(study: str, n_seeds: int, *overrides: str) -> list[list[Experiment]]:
@@ -347,3 +382,13 @@ def _boxes(errors: pd.DataFrame) -> pd.DataFrame:
     ]
     kept = ["method", "error", "n", "whislo", "q1", "med", "q3", "whishi", "mean"]
     return pd.DataFrame(rows)[kept]
+
+
+_AT = {"k_m": "robot.kr", "sigma_range_m": "sensors.laser.sigma_range_m"}
+_RUN_BY: dict[str, tuple[str, str, Callable[..., Tables], dict[str, str]]] = {
+    "runs": ("methods", "method", _drive, {"rate_hz": _RUN["rate_hz"]}),
+    "steps": ("methods", "method", _drive, {"rate_hz": _RUN["rate_hz"]}),
+    "ellipses": ("corridor", "method", _closeup, {}),
+    "beliefs": ("beliefs", "belief", _scored, {}),
+    "ordering": ("ordering", "method", _scored, _AT),
+}  # by table: its study, the label of its rows, what makes them, and further keys by column

@@ -15,6 +15,7 @@ from estimators.odometry import Odometry
 from experiments.bench.fastslam import cost_by_landmarks
 from experiments.evaluation.metrics import position_errors_m, rms, travelled_m
 from experiments.judging.jobs import Progress, Tables, group_by, tables_of
+from experiments.judging.remake import Cells, Remake, agrees
 from experiments.judging.results import Profile, Results
 from experiments.papers.gil2008 import scores, settings
 from experiments.papers.gil2008.recordings import Scene, landmark_distances_m, thin, whole
@@ -29,7 +30,7 @@ from sim.arrays import Array
 from sim.recording import Recording
 from sim.robot.arc import arc_increment
 from sim.robot.slip import wheel_errors
-from sim.sensors import StereoCamera
+from sim.sensors import StereoCamera, sensor_of
 
 TableRun = tuple[str, Experiment]  # the table its rows go to; its configuration
 
@@ -85,8 +86,22 @@ def plan(profile: Profile) -> Iterator[TableRun]:
                 yield table, one.with_values(repeats=min(one.repeats, n_repeats))
 
 
-def rows_of(runs: Sequence[TableRun]) -> Tables:
-    """Rows of every run over one recording, by table."""
+REMADE = dict.fromkeys(settings.LABELS, 2.7)  # not the times of `cost`
+
+
+def remake(table: str, row: Cells) -> Remake | None:
+    """The call that makes a row again; None if no run is like it."""
+    for one in plan_experiments([f"study=gil2008/{table}", f"seed={row['seed']:.0f}"]):
+        camera = sensor_of(one.sensors(), "stereo", StereoCamera)
+        shown = {"n_seen": camera.max_observations, "rule": camera.selection}
+        labels = dataclasses.asdict(Scene.of(one)) | labels_of(table, one) | shown
+        if agrees(row, {**labels, "max_distance_m": camera.max_distance_m}):
+            return rows_of, ([(table, one)], int(row["repeat"]))
+    return None
+
+
+def rows_of(runs: Sequence[TableRun], repeat: int | None = None) -> Tables:
+    """Rows of every run over one recording, by table; those of one repeat, if one is given."""
     first = runs[0][1]
     scene, recording = Scene.of(first), whole(first)
     truth, robot = recording.truth_at(recording.frame_stamps), first.robot()
@@ -104,10 +119,10 @@ def rows_of(runs: Sequence[TableRun]) -> Tables:
         seen = thin(recording, experiment)
         labels = labels_of(table, experiment)
         shown = common | labels | _shown(seen)
-        for repeat in range(experiment.repeats):
-            index = 100 * scene.draw + scene.image_draw + repeat
+        for number in range(experiment.repeats) if repeat is None else [repeat]:
+            index = 100 * scene.draw + scene.image_draw + number
             rng = stream(scene.seed, f"estimator/{table}/{labels}", index)
-            row = {**shown, "repeat": repeat, **one_run(experiment, seen, rng)}
+            row = {**shown, "repeat": number, **one_run(experiment, seen, rng)}
             rows.setdefault(table, []).append(row)
     return rows
 

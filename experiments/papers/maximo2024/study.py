@@ -7,6 +7,7 @@ on seeds from 1000 on.
 
 import itertools
 import math
+from collections.abc import Iterable
 
 import numpy as np
 import pandas as pd
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from estimators.topological.topological_map import from_recording
 from experiments.bench import topological
 from experiments.judging.jobs import Progress, Tables, tables_of
+from experiments.judging.remake import Cells, Remake
 from experiments.judging.results import Arrays, Profile, Results
 from experiments.papers.maximo2024.claims import headlines
 from experiments.papers.maximo2024.places import oxford_runs, resequence
@@ -27,6 +29,7 @@ from experiments.papers.maximo2024.settings import (
     HELD,
     ITERATIONS,
     JUDGED_SEED,
+    METHODS,
     N_CAMPUSES,
     N_CLUSTERED_CAMPUSES,
     N_QUALITY_WORLDS,
@@ -60,6 +63,7 @@ from experiments.papers.maximo2024.worlds import (
     starts,
     weighting_rows,
 )
+from experiments.runs.row import Row
 from experiments.runs.seeds import stream
 from sim import se2
 from sim.arrays import Array
@@ -117,15 +121,58 @@ def _jobs(profile: Profile) -> list[tuple[Job, float]]:
     ]
 
 
-def _labelled(what: str, name: str, seed: int, profile: Profile) -> Tables:
-    """All rows of a job, by table, with the geometry and seed of its world."""
+REMADE = {
+    "campus_starts": 30.0,
+    "clusters": 2.0,
+    "dispersion": 4.0,
+    "kidnapping": 1.5,
+    "particles": 4.0,
+    "quality": 3.0,
+    "runs": 15.0,
+    "starts": 1.0,
+    "weighting": 4.0,
+}  # not means and times
+
+
+def are_here(table: pd.DataFrame) -> NDArray[np.bool_]:
+    """Which rows can be made here: those of the real positions only with them."""
+    real = table["geometry"].isin(("oxford_real", "oxford_runs"))
+    return np.asarray(~real | POSITIONS.is_file())
+
+
+def remake(table: str, row: Cells) -> Remake:
+    """The call that makes a row again."""
+    name = row["geometry"]
+    of_route = dict.fromkeys(("starts", "kidnapping", "clusters", "particles"), "route")
+    what = {**of_route, "dispersion": "weighting"}.get(table, table)
+    what = "campus" if name == "campus" else what
+    return _labelled, (what, name, int(row["seed"]), Profile.FULL, table, row.get("method"))
+
+
+def _labelled(
+    what: str,
+    name: str,
+    seed: int,
+    profile: Profile,
+    only: str | None = None,
+    method: str | None = None,
+) -> Tables:
+    """All rows of a job, by table, with the geometry and seed of its world.
+
+    Parameters
+    ----------
+    only, method
+        The table and weighting that are wanted, where the others cost more time; None for all.
+    """
     return {
         table: [{"geometry": name, "seed": seed, **row} for row in rows]
-        for table, rows in _rows(what, name, seed, profile).items()
+        for table, rows in _rows(what, name, seed, profile, only, method).items()
     }
 
 
-def _rows(what: str, name: str, seed: int, profile: Profile) -> dict[str, Rows]:
+def _rows(
+    what: str, name: str, seed: int, profile: Profile, only: str | None, method: str | None
+) -> dict[str, Rows]:
     """All rows of a job, by table."""
     n_repeats = N_REPEATS[profile]
     if what == "campus":
@@ -137,18 +184,19 @@ def _rows(what: str, name: str, seed: int, profile: Profile) -> dict[str, Rows]:
         return {"runs": [{"run": n, **row} for n in names for row in run_rows(n, seed, n_fewer)]}
     case = make_case(name, seed)
     if what in ("weighting", "control"):
-        return weighting_rows(case, n_repeats)
+        return weighting_rows(case, n_repeats, METHODS if method is None else (method,))
     settings, tolerance_m = options(case), TOLERANCE * case.known_map.spacing_m
     by_mode = settings | {"estimate": "mode"}
-    return {
-        "starts": [
+    found: dict[str, Iterable[Row]] = {  # made as they are read
+        "starts": (
             {"start": start, "settled_at": settled}
             for start, settled, _ in starts(case, N_STARTS[profile], settings, tolerance_m)
-        ],
-        "kidnapping": list(kidnapping_rows(case, by_mode, 0.05, 5, RECOVERED_WITHIN + HELD)),
-        "clusters": [cluster_row(case.known_map, case.recording, "synthetic", seed)],
-        "particles": list(particle_rows(case, n_repeats)),
+        ),
+        "kidnapping": kidnapping_rows(case, by_mode, 0.05, 5, RECOVERED_WITHIN + HELD),
+        "clusters": map(cluster_row, [case.known_map], [case.recording], ["synthetic"], [seed]),
+        "particles": particle_rows(case, n_repeats),
     }
+    return {table: list(rows) for table, rows in found.items() if only in (None, table)}
 
 
 def times(n_repeats: int) -> pd.DataFrame:

@@ -155,11 +155,11 @@ def settling_step(errors_m: Array, tolerance_m: float) -> float:
     return float(first[0]) if len(first) else math.nan
 
 
-def weighting_rows(case: Case, n_repeats: int) -> dict[str, Rows]:
+def weighting_rows(case: Case, n_repeats: int, methods: Sequence[str] = METHODS) -> dict[str, Rows]:
     """Table 1 and figure 4: errors of each method over the whole route, and dispersions."""
     tables: dict[str, Rows] = {"weighting": [], "dispersion": []}
     nearest_m = _nearest_node_m(case)
-    for method in METHODS:
+    for method in methods:
         settings = options(case, method)
         walks = _repeated(case, settings, "estimator/topological_mcl", n_repeats)
         label = {"method": method, "n_nearest": settings["n_nearest"]}

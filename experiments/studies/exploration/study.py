@@ -13,6 +13,7 @@ from estimators.base import Estimate
 from experiments.evaluation.map_quality import landmark_errors
 from experiments.evaluation.metrics import travelled_m
 from experiments.judging.jobs import Progress, Tables, tables_of
+from experiments.judging.remake import Cells, Remake
 from experiments.judging.results import Profile, Results
 from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
@@ -47,6 +48,14 @@ def run(profile: Profile, out: Results, on_progress: Progress) -> None:
     for strategy in (settings.BASE, settings.JUDGED):
         team = compose_experiment(settings.FIRST_SEED, strategy).recordings()
         out.write_arrays(f"drive_{strategy}", **drive_of(team.robots, settings.AFTER_M))
+
+
+REMADE = {"runs": 5.0, "coverage": 5.0}
+
+
+def remake(_table: str, row: Cells) -> Remake:
+    """The call that makes a row again."""
+    return tables_from, (int(row["seed"]), row["strategy"])
 
 
 def tables_from(seed: int, strategy: str) -> Tables:

@@ -20,7 +20,7 @@ from experiments.calibration.logs import (
 from experiments.evaluation.metrics import score, travelled_m
 from experiments.evaluation.relations import relation_errors
 from experiments.evaluation.time_sync import aligned_ate_m
-from experiments.judging.jobs import Progress, in_parallel
+from experiments.judging.jobs import Progress, Tables, in_parallel
 from experiments.judging.logs import (
     CALIBRATED_S,
     DATA,
@@ -29,7 +29,9 @@ from experiments.judging.logs import (
     relations_of,
     track,
     tuned_until_s,
+    why_missing,
 )
+from experiments.judging.remake import Cells, Remake, whole
 from experiments.judging.results import Profile, Results
 from experiments.runs.evaluate import run_over
 from experiments.runs.experiment import Experiment
@@ -98,6 +100,26 @@ def run(profile: Profile, out: Results, on_progress: Progress) -> None:
     out.write_arrays("wean", **drawn)
     out.write_tables(mrclam=slam, wean=fits)
     on_progress(1.0)
+
+
+REMADE = {"ate": 10.0, "wheels": 10.0, "lego": 10.0, "mrclam": 20.0}  # others take minutes
+
+
+def remake(table: str, row: Cells) -> Remake | None:
+    """The call that makes a row again; None without the logs."""
+    makers = {"ate": rawseeds_ate, "wheels": wheels, "lego": lego_errors}
+    if why_missing():
+        return None
+    if table == "mrclam":
+        runs = plan_experiments(["study=real_logs/mrclam", f"recording.robot={row['robot']:.0f}"])
+        run = dict(zip(MRCLAM, runs, strict=True))[row["method"]]
+        job = (run, row["method"], int(row["robot"]), int(row["seed"]))
+        return _landmark_rows, job
+    return whole, (table, makers[table])
+
+
+def _landmark_rows(run: Experiment, method: str, robot: int, seed: int) -> Tables:
+    return {"mrclam": [_landmark_job(run, method, robot, seed)[0]]}
 
 
 # --- Rawseeds ------------------------------------------------------------------------------------

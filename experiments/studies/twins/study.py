@@ -8,7 +8,8 @@ import pandas as pd
 
 from experiments.evaluation.metrics import score
 from experiments.judging.jobs import Progress, Tables, tables_of
-from experiments.judging.logs import known_start
+from experiments.judging.logs import known_start, why_missing
+from experiments.judging.remake import Cells, Remake
 from experiments.judging.results import Profile, Results
 from experiments.runs.evaluate import run_over
 from experiments.runs.experiment import Experiment
@@ -40,15 +41,32 @@ def run(profile: Profile, out: Results, on_progress: Progress) -> None:
     profile
         `quick`: 4 simulations of each log in place of 50.
     """
-    runs = {
-        kind: dict(zip(names, plan_experiments([f"study=twins/{kind}"]), strict=True))
-        for kind, names in METHODS.items()
-    }
+    runs = _planned()
     seeds = range(FIRST_SEED, FIRST_SEED + RUNS[profile])
     jobs = [(log, seed, runs) for log in LOGS for seed in (None, *seeds)]
     made = tables_of(errors, jobs, on_progress)
     pairs = predict_pairs(made["runs"])
     out.write_tables(**made, pairs=pairs, others=held_by_others(pairs))
+
+
+def _planned() -> dict[str, dict[str, Experiment]]:
+    """Experiments by the kind of log and the method."""
+    return {
+        kind: dict(zip(names, plan_experiments([f"study=twins/{kind}"]), strict=True))
+        for kind, names in METHODS.items()
+    }
+
+
+REMADE = {"runs": 60.0}  # the others are made of it
+
+
+def remake(_table: str, row: Cells) -> Remake | None:
+    """The call that makes a row again; None without the logs."""
+    if why_missing():
+        return None
+    one = {row["kind"]: {row["method"]: _planned()[row["kind"]][row["method"]]}}
+    seed = None if row["seed"] < 0 else int(row["seed"])
+    return errors, (row["log"], seed, one)
 
 
 @functools.lru_cache(maxsize=1)

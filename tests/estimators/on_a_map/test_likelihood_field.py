@@ -14,7 +14,7 @@ from sim.worlds.world import World
 from tests.estimators.laser.test_icp import ROOM
 
 LASER = Laser(n_beams=90, max_range_m=30.0, mount=Mount(x_m=0.2, y_m=-0.1, z_m=0.3, yaw_rad=0.4))
-SIGMA_M, Z_HIT, Z_RAND = 0.15, 0.8, 0.2
+SIGMA_M, MAX_LOSS = 0.15, 3.0
 
 
 def world(walls=ROOM, heights=(0.0, 1.0)):
@@ -22,15 +22,14 @@ def world(walls=ROOM, heights=(0.0, 1.0)):
 
 
 def field(cell_m=0.1, **options):
-    given = {"sigma_m": SIGMA_M, "z_hit": Z_HIT, "z_rand": Z_RAND, **options}
+    given = {"sigma_m": SIGMA_M, "max_loss": MAX_LOSS, **options}
     return likelihood_field(world(), LASER, FieldOptions(cell_m=cell_m, **given))
 
 
 def log_p(points):
     """The mixture at points (N, 2), straight from the distances to the walls."""
     distances = np.array([world().clearance_m(point) for point in points])
-    hit = np.exp(-0.5 * (distances / SIGMA_M) ** 2) / (SIGMA_M * math.sqrt(2.0 * math.pi))
-    return np.log(Z_HIT * hit + Z_RAND / LASER.max_range_m)
+    return np.log(np.exp(-0.5 * (distances / SIGMA_M) ** 2) + math.exp(-MAX_LOSS))
 
 
 def test_cells_hold_the_mixture_at_their_middle():
@@ -39,7 +38,7 @@ def test_cells_hold_the_mixture_at_their_middle():
     rows, columns = made.table.shape
     cells = np.column_stack([rng.integers(rows, size=400), rng.integers(columns, size=400)])
     middles = made.origin_m + (cells[:, ::-1] + 0.5) * made.cell_m
-    at_wall = np.log(Z_HIT / (SIGMA_M * math.sqrt(2 * math.pi)) + Z_RAND / LASER.max_range_m)
+    at_wall = math.log1p(math.exp(-MAX_LOSS))
     table = made.table[cells[:, 0], cells[:, 1]]
     np.testing.assert_allclose(-made.step * table, log_p(middles) - at_wall, atol=2e-3)
     rim = np.concatenate([made.table[[0, -1]].ravel(), made.table[:, [0, -1]].ravel()])

@@ -41,9 +41,9 @@ def study(*, names=("runs", "noise"), fails=False):
         return [Claim(Subject("GI1", "share"), "a share", found, "above 0", Verdict.REPRODUCED)]
 
     return {
-        "study": SimpleNamespace(run=run),
-        "figures": SimpleNamespace(draw=draw),
-        "claims": SimpleNamespace(judge=judge),
+        "study": SimpleNamespace(run=run, __name__=f"experiments.papers.{PAPER}.study"),
+        "figures": SimpleNamespace(draw=draw, __name__=f"experiments.papers.{PAPER}.figures"),
+        "claims": SimpleNamespace(judge=judge, __name__=f"experiments.papers.{PAPER}.claims"),
     }
 
 
@@ -52,7 +52,7 @@ def results(tmp_path, monkeypatch):
     """A folder with the judged results of a study."""
     monkeypatch.setenv("ESTIMA_RESULTS", str(tmp_path))
     take(monkeypatch, study())
-    module.reproduce(full=True, only=PAPER)
+    module.reproduce(only=PAPER)
     write_frame(pd.DataFrame({"best": [1]}), tmp_path / "tables" / f"{PAPER}_tuning.csv")
     return tmp_path
 
@@ -79,18 +79,13 @@ ENDINGS = (".csv", ".npz", ".png")
 FULL = {f"{PAPER}_{n}{e}" for n in ("runs", "noise") for e in ENDINGS} | {f"{PAPER}_tuning.csv"}
 
 
-def test_a_full_run_replaces_everything_and_a_quick_one_nothing(results, monkeypatch):
-    judged = state(results)
-    assert judged == (FULL, "full", "reproduced, full", "full")
+def test_a_run_replaces_everything(results, monkeypatch):
+    assert state(results) == (FULL, "full", "reproduced, full", "full")
     take(monkeypatch, study(names=("runs",)))
     module.reproduce(only=PAPER)
-    assert state(results) == judged
-    kept = {f"{PAPER}_{name}" for name in ("runs.csv", "runs.npz", "runs.png")}
-    assert state(results / "quick") == (kept, "quick", "reproduced, quick", "quick")
-    module.reproduce(full=True, only=PAPER)
-    kept.add(f"{PAPER}_tuning.csv")
+    kept = {f"{PAPER}_{name}" for name in ("runs.csv", "runs.npz", "runs.png", "tuning.csv")}
     assert state(results) == (kept, "full", "reproduced, full", "full")
-    assert not list((results / "cache").iterdir())
+    assert {path.name for path in (results / "cache").iterdir()} <= {"sources.json"}
 
 
 def test_each_claim_gets_one_row_and_one_line(results, capsys):
@@ -104,21 +99,23 @@ def test_each_claim_gets_one_row_and_one_line(results, capsys):
     }
     capsys.readouterr()
     module.reproduce(only=PAPER)
-    (row,) = read_verdicts(results / "quick" / "verdicts.csv").to_dict("records")
-    assert row["sentence"] == "The share is 0.5. Half of it. (Quick profile: few repeats.)"
     claim, blank, paper, page = capsys.readouterr().out.splitlines()
     assert claim == "GI1  reproduced      The share is 0.5."
     assert blank == ""
     assert paper.startswith("gil2008: 1 reproduced (")
-    assert "quick/report.html" in page
+    assert "report.html" in page
 
 
 def test_an_interrupted_run_leaves_the_results_as_they_were(results, monkeypatch):
-    before = {path: path.read_bytes() for path in results.rglob("*.*") if path.is_file()}
+    def files():
+        paths = [path for path in results.rglob("*.*") if path.is_file()]
+        return {path: path.read_bytes() for path in paths if path.parent.name != "cache"}
+
+    before = files()
     take(monkeypatch, study(names=("runs", "other"), fails=True))
     with pytest.raises(KeyboardInterrupt):
-        module.reproduce(full=True, only=PAPER)
-    assert before == {path: path.read_bytes() for path in results.rglob("*.*") if path.is_file()}
+        module.reproduce(only=PAPER)
+    assert before == files()
 
 
 def test_what_cannot_be_replaced_or_added_to_is_named(results):
@@ -126,13 +123,13 @@ def test_what_cannot_be_replaced_or_added_to_is_named(results):
     path.unlink()
     path.mkdir()
     with pytest.raises(InputError, match=r"gil2008_runs\.png: cannot be replaced"):
-        module.reproduce(full=True, only=PAPER)
+        module.reproduce(only=PAPER)
     (results / "verdicts.csv").write_text("id,paper")
     with pytest.raises(InputError, match=r"verdicts\.csv: the last row is cut off"):
-        module.reproduce(full=True, only=PAPER)
+        module.reproduce(only=PAPER)
     (results / "claims.csv").write_text("id,paper")
     with pytest.raises(InputError, match=r"claims\.csv: the last row is cut off"):
-        module.reproduce(full=True, only=PAPER)
+        module.reproduce(only=PAPER)
 
 
 def test_figures_are_drawn_again_from_disk(results, monkeypatch, capsys):
@@ -173,7 +170,7 @@ def test_files_without_their_content_end_in_one_line(results, monkeypatch, name,
     def draw(made):
         return {made.table("runs")["profile"].str.upper()[0]: made.arrays("runs")["path"]}
 
-    take(monkeypatch, {**study(), "figures": SimpleNamespace(draw=draw)})
+    take(monkeypatch, {**study(), "figures": SimpleNamespace(draw=draw, __name__="figures")})
     if isinstance(content, dict):
         np.savez(results / name, **content)
     else:
@@ -187,6 +184,6 @@ def test_a_programming_error_in_a_fresh_study_keeps_its_trace(results, monkeypat
     def run(profile, out, on_progress):
         raise KeyError("a slip of ours")
 
-    take(monkeypatch, {**study(), "study": SimpleNamespace(run=run)})
+    take(monkeypatch, {**study(), "study": SimpleNamespace(run=run, __name__="study")})
     with pytest.raises(KeyError, match="a slip of ours"):
         module.reproduce(only=PAPER)

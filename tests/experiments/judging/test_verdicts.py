@@ -33,7 +33,7 @@ from experiments.judging.claims_file import (
     write_claims,
     write_verdicts,
 )
-from experiments.judging.folders import findings
+from experiments.judging.folders import LOGS, NAMED, PAPERS, findings
 from experiments.judging.results import Profile, Results
 from experiments.judging.sentences import (
     Conclusion,
@@ -42,7 +42,7 @@ from experiments.judging.sentences import (
     plain,
     sentence,
 )
-from experiments.reproduce import LOGS, NAMED, PAPERS, judgement
+from experiments.reproduce import judgement
 from experiments.runs.paths import SOURCE
 from sim.errors import InputError
 

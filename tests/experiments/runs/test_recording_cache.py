@@ -14,13 +14,18 @@ from sim.recording import load
 from tests.sim.test_recording import small_recording
 
 
+def small():
+    """A small recording that depends on nothing."""
+    return small_recording(), {}
+
+
 def test_the_cache_makes_once_and_mends_damage(tmp_path, monkeypatch):
     monkeypatch.setenv("ESTIMA_RESULTS", str(tmp_path))
     made = []
 
     def make():
         made.append(1)
-        return small_recording()
+        return small_recording(), {}
 
     for _ in range(3):
         recording = fetch_or_make("a", make)
@@ -42,16 +47,16 @@ def test_the_cache_makes_once_and_mends_damage(tmp_path, monkeypatch):
 def test_the_cache_drops_what_was_used_longest_ago_but_nothing_in_use(tmp_path, monkeypatch):
     monkeypatch.setenv("ESTIMA_RESULTS", str(tmp_path))
     for age, key in enumerate("abcd"):
-        fetch_or_make(key, small_recording)
+        fetch_or_make(key, small)
         os.utime(folder() / f"{key}.npz", (1000.0 + age, 1000.0 + age))
-    fetch_or_make("b", small_recording)  # used again
+    fetch_or_make("b", small)  # used again
     size = files()[0][1]
     with (folder() / "a.lock").open("w") as handle:
         fcntl.flock(handle, fcntl.LOCK_EX)
         assert trim(2 * size) == 2
     assert [path.stem for path, _ in files()] == ["a", "b"]
     monkeypatch.setenv("ESTIMA_CACHE_GIB", str(2.5 * size / 2**30))
-    fetch_or_make("e", small_recording)
+    fetch_or_make("e", small)
     assert [path.stem for path, _ in files()] == ["b", "e"]
     monkeypatch.setenv("ESTIMA_CACHE_GIB", "much")
     with pytest.raises(InputError, match="ESTIMA_CACHE_GIB"):
@@ -62,7 +67,7 @@ def _fetch(log):
     def make():
         with open(log, "a") as f:
             f.write("made\n")
-        return small_recording()
+        return small()
 
     fetch_or_make("a", make)
 

@@ -10,12 +10,17 @@ import pytest
 
 from experiments.runs import store
 from experiments.runs.row import Outcome, Status
+from experiments.runs.version import code_version
 from sim.errors import InputError
 
 
 def row(number, **values):
     """A row of the run with this number as its key."""
-    origin = {"run_key": f"{number:016x}", "code_version": "v", "recording_checksum": "c"}
+    origin = {
+        "run_key": f"{number:016x}",
+        "code_version": code_version(),
+        "recording_checksum": "c",
+    }
     return {"seed": number, "robot.kr": 1e-5, "repeat": 0, **origin, **Status().columns(), **values}
 
 

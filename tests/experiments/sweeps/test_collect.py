@@ -9,7 +9,15 @@ from typer.testing import CliRunner
 from experiments.cli.main import app
 from experiments.report.export import as_text
 from experiments.report.plot import by_factors, sweep_figure
-from experiments.runs.columns import COLUMNS, ORIGIN, REPEAT, STATUS, is_setting, title
+from experiments.runs.columns import (
+    COLUMNS,
+    DEPENDENCIES,
+    ORIGIN,
+    REPEAT,
+    STATUS,
+    is_setting,
+    title,
+)
 from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
 from experiments.sweeps.collect import (
@@ -357,7 +365,12 @@ def test_every_column_of_a_row_is_in_the_schema():
     overrides += ["simulation.physics=kinematic", "route.distance_m=12"]
     experiment = Experiment.compose(overrides)
     (row,) = evaluate(experiment, experiment.simulate_team)
-    others = {name for name in row if not is_setting(name)} - {REPEAT, *STATUS, *ORIGIN}
+    others = {name for name in row if not is_setting(name)} - {
+        REPEAT,
+        *STATUS,
+        *ORIGIN,
+        DEPENDENCIES,
+    }
     assert others <= set(COLUMNS)
     assert {"ate_rmse_m", "rpe_10m_rmse_m", "revised_nees_mean", "step_time_us"} <= others
     assert set(experiment.config) - {"keep", "picture"} <= {

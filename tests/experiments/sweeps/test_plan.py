@@ -5,9 +5,7 @@ import pytest
 
 from experiments.runs.compose import searched
 from experiments.runs.experiment import Experiment
-from experiments.runs.key import files_digest
 from experiments.runs.paths import quoted, results
-from experiments.runs.version import source_digest
 from experiments.sweeps import launch, plan
 from sim.errors import InputError
 from tests.experiments.cli.test_cli import QUICK, called, refused
@@ -90,65 +88,12 @@ def test_unknown_keys_and_options_are_refused():
     refused(called("run", "-m", "--frob", "seed=1,2"), "--frob")
 
 
-def test_keys_depend_on_what_decides_the_rows(tmp_path, monkeypatch):
+def test_keys_depend_on_the_settings():
     experiment = Experiment.compose([])
     assert experiment.with_values(name="other").key == experiment.key
     assert experiment.with_values(seed=5).key != experiment.key
-    monkeypatch.syspath_prepend(str(tmp_path))
-    (tmp_path / "package").mkdir()
-    for target, source, beside in (
-        ("mine_for_key.Mine", "mine_for_key.py", "helper_of_mine.py"),
-        ("package.part.Mine", "package/part.py", "package/other.py"),  # without an __init__
-    ):
-        (tmp_path / source).write_text("import helper_of_mine\nclass Mine: pass\n")
-        own = experiment.with_values(estimator={"_target_": target})
-        keys = [own.key]
-        for file in (source, beside):
-            (tmp_path / file).write_text("import helper_of_mine\nclass Mine: x = 1\n")
-            source_digest.cache_clear()
-            keys.append(own.key)
-        assert len(set(keys)) == 3, target
     with pytest.raises(InputError, match=r"nowhere\.npz"):
         _ = experiment.with_values(recording="nowhere.npz").recording_key
-
-
-def test_keys_know_the_files_that_a_mapping_names(tmp_path):
-    (tmp_path / "a.npy").write_bytes(b"1")
-    named = {
-        "_target_": "experiments.papers.maximo2024.places.recording_from_files",
-        "positions": f"{tmp_path}/a.npy",
-    }
-    experiment = Experiment.compose([])
-    prior = experiment.config["prior"]
-    for changed in (
-        experiment.with_values(recording=named),
-        experiment.with_values(prior={**prior, "map": named}),
-        experiment.with_values(prior={**prior, "map": {"_target_": "x", "f": str(tmp_path)}}),
-    ):
-        (tmp_path / "a.npy").write_bytes(b"1")
-        before = changed.key
-        (tmp_path / "a.npy").write_bytes(b"2")
-        assert changed.key != before
-    assert files_digest({"a": "none", "b": "x" * 5000, "c": ".", "d": "/"}) == {}
-
-
-def test_keys_know_the_files_that_an_estimators_options_name(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    plain = Experiment.compose(["estimator=topological_mcl"])
-    before_files = plain.key, plain.recording_key
-    for name in ("a.npz", "b.npz", "laser", "stereo", "place", "lidar3d"):  # words are sensors
-        (tmp_path / name).write_bytes(b"1")
-    assert (plain.key, plain.recording_key) == before_files
-    feedback = {"_target_": "estimators.odometry.Odometry", "tables": ["none", "a.npz"]}
-    named = plain.with_estimator(map_path="a.npz")
-    steered = plain.with_values(route={**plain.config["route"], "feedback": feedback})
-    swept = ["estimator=topological_mcl", "estimator.map_path=a.npz,b.npz"]
-    old = named.key, steered.key, steered.recording_key, plan.make_plan(swept).keys[0]
-    (tmp_path / "a.npz").write_bytes(b"2")
-    new = named.key, steered.key, steered.recording_key, plan.make_plan(swept).keys[0]
-    assert all(a != b for a, b in zip(old, new, strict=True))
-    every = plan.make_plan(swept)
-    assert [int(every.experiment(i).key, 16) for i in range(2)] == every.keys.tolist()
 
 
 def test_packing_keeps_recordings_together():
@@ -159,24 +104,6 @@ def test_packing_keeps_recordings_together():
     for job in jobs:
         assert len({every.experiment(i).seed for i in job}) == 2
     assert max(len(job) for job in plan.pack_jobs(every.recordings, 100)) == 1
-
-
-def test_only_what_an_estimator_imports_is_of_its_version(tmp_path, monkeypatch):
-    for module, text in (("tidal", "import tidal_a\n"), ("tidal_a", "from tidal_b import x\n"),
-                         ("tidal_b", "x = 1\n"), ("other", "y = 1\n")):  # fmt: skip
-        (tmp_path / f"{module}.py").write_text(text)
-    monkeypatch.syspath_prepend(str(tmp_path))
-
-    def digest():
-        source_digest.cache_clear()
-        return source_digest("tidal.Own")
-
-    first = digest()
-    (tmp_path / "other.py").write_text("y = 2\n")
-    (tmp_path / "more.py").write_text("def broken(\n")
-    assert digest() == first
-    (tmp_path / "tidal_b.py").write_text("x = 2\n")
-    assert digest() != first
 
 
 @pytest.mark.parametrize(

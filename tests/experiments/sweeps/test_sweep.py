@@ -21,10 +21,8 @@ from experiments.runs.paths import results
 from experiments.runs.processes import hold_interrupts
 from experiments.runs.row import Status, read_rows
 from experiments.runs.store import read_runs
-from experiments.runs.version import source_digest
 from experiments.sweeps import launch, plan, work
 from experiments.sweeps.collect import collect
-from sim.errors import InputError
 from tests.experiments.cli.test_cli import QUICK, ROOT, called, estima, refused
 from tests.experiments.sweeps.conftest import ALONE, SHORT, clear, folder, table_of
 from tests.fixtures import kill_sweeps
@@ -103,11 +101,11 @@ def test_an_estimator_that_ends_its_process_costs_its_own_runs(name, tmp_path, b
     assert (bad["status"] == "failed").all()
     assert (bad["status_code"] + ": " + bad["status_detail"]).str.contains(words).all()
     assert len(rows) == 4
-    assert {path.suffix for path in folder(name).iterdir()} == {".parquet", ".txt"}
+    assert {path.suffix for path in folder(name).iterdir()} == {"", ".parquet", ".txt"}
 
 
 @pytest.mark.slow
-def test_rows_of_an_edited_estimator_do_not_mix(name, tmp_path, monkeypatch, capsys):
+def test_rows_of_an_edited_estimator_do_not_mix(name, tmp_path, capsys):
     for body in ("pass", "frame.wheel_increments_m"):
         words = own_estimator(tmp_path, body)
         done = estima(
@@ -119,10 +117,6 @@ def test_rows_of_an_edited_estimator_do_not_mix(name, tmp_path, monkeypatch, cap
         )
         assert done.returncode == 0, done.stderr
         assert "0 of them done before" in done.stderr
-    with pytest.raises(InputError, match=r"several versions.*estuary\.Own"):
-        table_of(name)
-    monkeypatch.syspath_prepend(str(tmp_path))
-    source_digest.cache_clear()
     assert len(table_of(name)) == 2
     assert "left out 2 rows" in capsys.readouterr().err
     assert len(collect(name, all_versions=True)) == 4
@@ -143,7 +137,7 @@ def test_two_sweeps_of_one_name_at_once(name):
         _, errors = process.communicate(timeout=120)
         assert process.returncode == 0, errors
     assert sorted(table_of(name)["seed"]) == [*range(15), *range(100, 115)]
-    assert {path.suffix for path in folder(name).iterdir()} == {".parquet", ".txt"}
+    assert {path.suffix for path in folder(name).iterdir()} == {"", ".parquet", ".txt"}
 
 
 @pytest.mark.slow
@@ -353,7 +347,7 @@ def test_a_job_tried_again_goes_on(tmp_path, monkeypatch):
     """As Ray and SLURM do it, in the midst of a line."""
     every = plan.make_plan([*QUICK, "seed=range(0,4)"])
     jobs = launch.Jobs(tmp_path, 1)
-    jobs.add(every, np.arange(4))
+    jobs.add(*next(every.split(np.arange(4), 1)))
     share = json.loads(work.share_path(jobs.plan, 0).read_text())
     ran = []
 
@@ -484,5 +478,5 @@ def test_compiling_is_said_once_and_restarts_the_rate(tmp_path, monkeypatch, cap
 def test_nothing_is_left_of_the_plan(name):
     done = estima("run", "-m", *SHORT, "seed=0,1", f"name={name}")
     assert done.returncode == 0, done.stderr
-    assert {path.suffix for path in folder(name).iterdir()} == {".parquet", ".txt"}
+    assert {path.suffix for path in folder(name).iterdir()} == {"", ".parquet", ".txt"}
     assert not list(Path.cwd().glob("multirun*"))

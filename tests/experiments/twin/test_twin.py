@@ -10,6 +10,8 @@ from estimators.base import Prior
 from estimators.odometry import Odometry
 from experiments.cli.main import app
 from experiments.evaluation.metrics import position_errors_m, rms
+from experiments.runs.dependencies.digests import changed
+from experiments.runs.dependencies.recorder import recorded
 from experiments.runs.experiment import Experiment
 from experiments.twin.make import make_twin, way_of
 from sim import se2
@@ -107,9 +109,11 @@ def test_files_are_a_study_that_runs(tmp_path, log, monkeypatch):
     assert np.allclose(experiment.route().way[1], ours.way)
     beside = Experiment.compose(["study=again.yaml", "recording=again_log.npz"])
     assert beside.recording().checksum == ours.rest.checksum
-    key = experiment.recording_key
+    with recorded() as seen:
+        assert experiment.route().way is not None
+    found = seen.digests()
     write_tum(tmp_path / "again_way.tum", ours.stamps[:20], ours.way[:20])
-    assert Experiment.compose(["study=again.yaml"]).recording_key != key
+    assert changed(found) == [str(tmp_path / "again_way.tum")]
 
 
 def test_bad_input_is_named(tmp_path, log):

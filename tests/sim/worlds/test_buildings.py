@@ -121,7 +121,7 @@ def _cross(a, b):
         (["world=office", "world.rooms_visited=30"], None, "rooms_visited must lie in"),
         (["world=office", "world.corridor_m=9"], None, "corridor_m must lie between"),
         (["world=corridor", "world.curve_radius_m=1"], None, "curve_radius_m is too small"),
-        (["world=room", "world.n_landmarks=-1"], None, "n_landmarks must be zero or more"),
+        (["world=room", "world.n_landmarks=-1"], None, "n_landmarks must be from zero"),
         (["world=room", "world.look_alike_share=2"], None, r"look_alike_share must lie in"),
     ],
 )

@@ -339,31 +339,48 @@ def test_the_field_is_that_of_the_walls_to_half_a_cell():
 
 
 @pytest.mark.parametrize("yaw", [0.0, 0.7])
-def test_unknown_is_no_floor_and_likelier_than_free_but_not_than_walls(yaw):
+def test_unknown_is_no_floor_and_as_likely_as_free(yaw):
     """A wall along x, free below it, unknown above; the grid may lie askew."""
     values = np.zeros((80, 120), np.float32)
     values[40], values[41:] = 1.0, np.nan
     grid = OccupancyGrid(values, 0.05, np.array([2.0, 1.0, yaw]))
-    z_hit, z_rand, sigma_m = 0.9, 0.1, 0.1
-    field = likelihood_field(grid, LASER, FieldOptions(cell_m=0.02, sigma_m=sigma_m))
-    peak = z_hit / (sigma_m * math.sqrt(2 * math.pi)) + z_rand / 30.0
+    field = likelihood_field(grid, LASER, FieldOptions(cell_m=0.02, sigma_m=0.1, max_loss=3.0))
 
     def likelihood(y_cells):
         end = se2.transform(grid.origin, [[3.0, 0.05 * y_cells]]).T.astype(np.float32)
         at = field.log_likelihood(np.zeros((1, 3)), np.ascontiguousarray(end))[0]
-        return peak * math.exp(at)
+        return (1.0 + math.exp(-3.0)) * math.exp(at)
 
-    assert likelihood(40.5) == pytest.approx(peak, rel=0.05)
-    assert likelihood(10.5) == pytest.approx(z_rand / 30.0, rel=0.01)
-    assert likelihood(70.5) == pytest.approx(1.0 / 30.0, rel=0.01)
-    assert likelihood(400.5) == pytest.approx(1.0 / 30.0, rel=0.01)  # off the grid
-    assert likelihood(42.5) > 10.0 / 30.0  # just behind the wall: it may be hit there
+    assert likelihood(40.5) == pytest.approx(1.0 + math.exp(-3.0), rel=0.05)
+    for cells in (10.5, 70.5, 400.5):  # free, unknown, off the grid
+        assert likelihood(cells) == pytest.approx(math.exp(-3.0), rel=0.01)
+    for cells in (1.5, 3.5, 5.5):  # as much before the wall as behind it
+        assert likelihood(40.5 + cells) == pytest.approx(likelihood(40.5 - cells), rel=0.3)
     drawn = field.draw(2000, np.random.default_rng(0))
     places = se2.transform(se2.inverse(grid.origin), drawn[:, :2]) / 0.05
     assert np.all((places >= -0.5) & (places[:, :2] <= [120.5, 40.5]))
     assert places[:, 1].max() < 38.5  # off the wall, too
     with pytest.raises(InputError, match="no occupied cell"):
         likelihood_field(OccupancyGrid(np.zeros((3, 3), np.float32), 0.1), LASER, FieldOptions())
+
+
+def test_the_unknown_behind_a_wall_does_not_draw_the_robot_to_it():
+    """Beams that err by more than sigma_m, before a wall with unknown space behind.
+
+    At 1 / z_max there (5.6 m), and a tenth of that in free space, the likeliest pose is 12 mm too
+    far forward, since ends behind the wall lose less than ends before it.
+    """
+    values = np.zeros((80, 120), np.float32)
+    values[40], values[41:] = 1.0, np.nan
+    grid = OccupancyGrid(values, 0.05, np.zeros(3))
+    field = likelihood_field(grid, LASER, FieldOptions(cell_m=0.01))
+    rng = np.random.default_rng(0)
+    ends = np.column_stack([rng.uniform(2.0, 4.0, 20_000), rng.normal(2.025, 0.15, 20_000)])
+    shifts_m = np.linspace(-0.05, 0.05, 101)
+    poses = np.column_stack([np.zeros(101), shifts_m, np.zeros(101)])
+    at = field.log_likelihood(poses, np.ascontiguousarray(ends.T, np.float32))
+    peak = np.polyfit(shifts_m, at, 2)
+    assert abs(-0.5 * peak[1] / peak[0]) < 0.004
 
 
 def test_mcl_on_a_grid_is_about_as_good_as_on_walls():

@@ -10,6 +10,8 @@ import yaml
 from typer.testing import CliRunner
 
 from experiments.cli.main import app
+from experiments.runs.dependencies.digests import changed
+from experiments.runs.dependencies.recorder import recorded
 from experiments.runs.experiment import Experiment
 from experiments.viewing.animation import pictures
 from experiments.viewing.map import grid_along, path_of
@@ -18,6 +20,7 @@ from sim.errors import InputError
 from sim.recording import save
 from sim.team import Team
 from sim.worlds.buildings import from_grid
+from sim.worlds.floor_plan import gaps_m
 from sim.worlds.grid import rasterize
 from sim.worlds.grid_mapping import _between, map_scans
 from tests.experiments.cli.test_cli import called, refused
@@ -106,18 +109,21 @@ def copied(folder):
 GRID_RUN = ["estimator=mcl", "sensors=hokuyo", "simulation.physics=kinematic"]
 
 
-def test_an_edited_image_is_another_experiment_and_another_world(tmp_path):
+def test_what_reads_a_grid_depends_on_its_image(tmp_path):
     path = copied(tmp_path)
     known = Experiment.compose([*GRID_RUN, f"prior.map={path}"])
     world = Experiment.compose(["world=from_grid", f"world.path={path}"])
-    made = Experiment.compose(
-        [*GRID_RUN, f"prior.map={{_target_: sim.worlds.grid_file.read_grid, path: {path}}}"]
-    )
-    before = known.key, world.recording_key, made.key
-    known.check()
+    target = f"prior.map={{_target_: sim.worlds.grid_file.read_grid, path: {path}}}"
+    made = Experiment.compose([*GRID_RUN, target])
     image = path.with_suffix(".pgm")
+    seen = []
+    for read in (known.check, world.world, lambda: made._map(None)):
+        with recorded() as found:
+            read()
+        seen.append(found.digests())
+        assert {str(path), str(image)} <= set(seen[-1])
     image.write_bytes(image.read_bytes()[:-1] + b"\0")
-    assert not set(before) & {known.key, world.recording_key, made.key}
+    assert [changed(each) for each in seen] == [[str(image)]] * 3
 
 
 def test_an_estimator_that_cannot_use_a_grid_refuses_it_before_any_run():
@@ -191,3 +197,14 @@ def test_what_the_command_line_refuses(tmp_path):
         error = CliRunner().invoke(app, words).exception
         assert isinstance(error, InputError)
         assert said in str(error)
+
+
+def test_a_tour_is_planned_through_a_grid_without_way_points():
+    world = from_grid(rng=np.random.default_rng(0), path=str(MAP), stops=5)
+    legs = np.hstack([world.waypoints[:-1], world.waypoints[1:]])
+    assert gaps_m(legs, world.walls).min() > 0.4
+    assert np.array_equal(world.waypoints[0], world.waypoints[-1])
+    again = from_grid(rng=np.random.default_rng(1), path=str(MAP), stops=5)
+    assert not np.array_equal(world.waypoints[0], again.waypoints[0])
+    with pytest.raises(InputError, match="stops"):
+        from_grid(rng=np.random.default_rng(0), path=str(MAP), stops=1)

@@ -1,0 +1,1 @@
+"""What results depend on: found while they are made, and compared with what is here now."""
