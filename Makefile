@@ -2,6 +2,7 @@
 PYTHON ?= python3
 ESTIMA := .venv/bin/estima
 FULL ?= 0
+EXTRAS ?=
 
 .PHONY: help setup reproduce report test test-all lint types format docs lock peers clean
 
@@ -11,12 +12,13 @@ help:
 	@echo "make report            the page of results/, results/report.html"
 	@echo "make test              the default tests"
 	@echo "make test-all          the slow ones too"
+	@echo "make setup EXTRAS=tune,peers  optional packages; docs/install.md lists them"
 	@echo "make lint types        what a change must pass besides"
 	@echo "make docs              the documentation, into site/"
 	@echo "make peers             programs of other projects to compare with, into build/peers/"
 
 setup:
-	@$(PYTHON) tools/bootstrap.py
+	@$(PYTHON) tools/bootstrap.py $(EXTRAS)
 
 reproduce: setup
 	@$(ESTIMA) reproduce $(if $(filter-out 0,$(FULL)),--full)

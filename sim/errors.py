@@ -80,6 +80,11 @@ def naming(where: object) -> Iterator[None]:
         raise InputError(f"{where}: {error}") from error
 
 
+def how_to_install(extra: str) -> str:
+    """Say how an extra of the package is installed, in a clone and elsewhere."""
+    return f"`make setup EXTRAS={extra}` in a clone, else `pip install 'estima[{extra}]'`"
+
+
 def required(value: T | None, complaint: str) -> T:
     """Return the value.
 

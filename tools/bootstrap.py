@@ -1,13 +1,15 @@
 """Make `.venv` from `requirements.lock`: Python 3.11, pinned packages checked by hash.
 
 Needs nothing but some Python 3.8+ and pip. Run by `make`, twice as well as once: a finished
-environment is recognised by the digest of the lock file and left alone.
+environment is recognised by the digest of the lock file and left alone. Arguments are extras of
+pyproject.toml, such as `tune,peers`, which later runs keep; what the lock has keeps its version.
 """
 
 from __future__ import annotations
 
 import hashlib
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -90,11 +92,25 @@ def pinned_uv() -> str:
     return str(uv)
 
 
+def wanted_extras(known: str, before: str) -> list[str]:
+    """Extras of the command line and of an earlier set-up, which pyproject.toml must have."""
+    section = known.partition("[project.optional-dependencies]")[2].partition("\n[")[0]
+    names = re.findall(r"^(\w+) = \[", section, re.MULTILINE)
+    asked = [name for words in sys.argv[1:] for name in words.replace(",", " ").split()]
+    for name in asked:
+        if name not in names:
+            fail(f"no extra {name}; there are: {', '.join(names)}")
+    return sorted({*asked, *(name for name in before.split() if name in names)})
+
+
 def main() -> None:
     """Bring `.venv` to the state that the lock files name, or do nothing if it is there."""
     digest = hashlib.sha256(b"\0".join(p.read_bytes() for p in INPUTS)).hexdigest()
-    state = f"{digest} {ROOT}\n"
-    if STAMP.exists() and STAMP.read_text() == state:
+    stamped = STAMP.read_text() if STAMP.exists() else ""
+    before = stamped.partition("\n")[2]
+    extras = wanted_extras((ROOT / "pyproject.toml").read_text(), before)
+    state = f"{digest} {ROOT}\n{' '.join(extras)}"
+    if stamped == state:
         return
     uv, env = pinned_uv(), environment()
     print("set-up: making .venv (Python 3.11) from requirements.lock", flush=True)
@@ -105,7 +121,9 @@ def main() -> None:
     run([uv, "pip", "sync", "--quiet", "--compile-bytecode", "--require-hashes", lock], env)
     # by plain path, so that a clone named estima does not hide the package from its parent folder
     plain = ["--config-setting", "editable_mode=compat"]
-    local = ["--no-deps", "--no-build-isolation", *plain, "--editable", str(ROOT)]
+    what = f"{ROOT}[{','.join(extras)}]" if extras else str(ROOT)
+    pinned = ["--constraint", lock] if extras else ["--no-deps"]
+    local = ["--no-build-isolation", *pinned, *plain, "--editable", what]
     run([uv, "pip", "install", "--quiet", *local], env)
     print("set-up: compiling numerical code, some 15 s", flush=True)
     run([str(VENV / "bin" / "python"), "-m", "experiments.bench.compile"])

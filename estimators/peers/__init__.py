@@ -9,7 +9,7 @@ import numpy as np
 
 from estimators.base import Belief
 from sim.arrays import Array
-from sim.errors import InputError
+from sim.errors import InputError, how_to_install
 from sim.recording import Frame
 from sim.sensors import Laser
 
@@ -30,7 +30,7 @@ def package(name: str, extra: str) -> Any:
         return __import__(name, fromlist=["_"])  # which is seen by who records it
     except ImportError as error:
         raise MissingPackageError(
-            f"{name} cannot be imported ({error}); pip install 'estima[{extra}]'"
+            f"{name} cannot be imported ({error}); {how_to_install(extra)}"
         ) from error
 
 

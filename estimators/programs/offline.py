@@ -43,6 +43,16 @@ _NEEDED_BY = {"laser": ("log", "grid"), "map": ("map", "grid")}
 _CELL_M = 0.05  # of a world's {grid}
 
 
+def _places_in(command: str) -> set[str]:
+    return set(re.findall(r"\{(\w+)\}", command))
+
+
+def needs_of(command: str) -> frozenset[str]:
+    """The sensors, and `map`, from which the files that a command names are made."""
+    places = _places_in(command)
+    return frozenset(need for need, of in _NEEDED_BY.items() if places.intersection(of))
+
+
 @options("estimator")
 class OfflineOptions(ProgramOptions):
     """Options of a program that reads a whole log.
@@ -71,12 +81,12 @@ class OfflineOptions(ProgramOptions):
     @cached_property
     def places(self) -> set[str]:
         """Names of files in the command."""
-        return set(re.findall(r"\{(\w+)\}", " ".join(self.words)))
+        return _places_in(" ".join(self.words))
 
     @property
     def needs(self) -> frozenset[str]:
         """The sensors, and the map, from which the named files are made."""
-        return frozenset(need for need, of in _NEEDED_BY.items() if self.places.intersection(of))
+        return needs_of(" ".join(self.words))
 
 
 class Offline(OfflineOptions):

@@ -1,15 +1,15 @@
-"""Commands that display options, runs and maps: options, view, map."""
+"""Commands that display options, runs and maps: options, recommend, view, map."""
 
 from __future__ import annotations
 
-import itertools
+import shlex
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from experiments.cli import completion
-from experiments.cli.flags import ConfigDir
+from experiments.cli.flags import ConfigDir, Overrides
 from experiments.runs import columns, paths
 from experiments.runs.console import show
 from sim.errors import require
@@ -58,9 +58,9 @@ def options(
         return
     if group is not None:
         names = completion.options(group, config_dir)
-        show(
-            "\n".join(f"{n:{max(map(len, names))}}  {_about(group, n, config_dir)}" for n in names)
-        )
+        width = max(map(len, names))
+        said = (paths.about(_file_of(group, n, config_dir))["what"] for n in names)
+        show("\n".join(f"{n:{width}}  {what}" for n, what in zip(names, said, strict=True)))
         return
     for one in completion.GROUPS:
         print(f"{one:>10}: {', '.join(completion.options(one, config_dir))}")
@@ -71,14 +71,6 @@ def _file_of(group: str, name: str, config_dir: Path | None) -> Path:
     """YAML of an option, the user's own first."""
     files = (folder / group / f"{name}.yaml" for folder in (config_dir, paths.CONF) if folder)
     return next(file for file in files if file.exists())
-
-
-def _about(group: str, name: str, config_dir: Path | None) -> str:
-    """What an option is: the first sentence of the comment at the head of its YAML."""
-    lines = read_text(_file_of(group, name, config_dir)).splitlines()
-    head = itertools.takewhile(lambda line: line.startswith("#"), lines)
-    words = " ".join(line.lstrip("# ") for line in head if "@package" not in line)
-    return words.partition(". ")[0].removesuffix(".")
 
 
 def _describe(group: str, name: str, config_dir: Path | None) -> None:
@@ -111,6 +103,30 @@ def _group_of(name: str, config_dir: Path | None) -> str:
     several = " or ".join(f"`estima options {group} {name}`" for group in groups)
     require(len(groups) == 1, f"{name} is an option of several groups: {several}")
     return groups[0]
+
+
+def recommend(
+    overrides: Overrides = None,
+) -> None:
+    """Say which estimators fit a robot and its sensors, and how they did in the nearest settings.
+
+    The errors and times are those of the project's own tables, with how far their settings are from
+    yours; the last lines are the sweep that settles it.
+
+    Examples
+    --------
+      estima recommend sensors=hokuyo robot.kr=2e-5
+
+      estima recommend sensors=hokuyo prior.map=world world=office
+    """
+    from experiments.report.recommend import SURE, recommend
+
+    advice = recommend(overrides or [])
+    show(
+        f"{advice.text}\n\nTo be sure, run the best in your own setting:\n"
+        f"  {shlex.join(['estima', 'run', '-m', *advice.sweep])}\n"
+        f"  estima table {SURE} --times"
+    )
 
 
 def view(

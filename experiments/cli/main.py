@@ -75,6 +75,7 @@ _COMMANDS: dict[str, Callable[..., None]] = {  # as `estima --help` lists them
     "info": logs.info,
     "convert": logs.convert,
     "options": look.options,
+    "recommend": look.recommend,
     "view": look.view,
     "map": look.build_map,
     "score": score.score,

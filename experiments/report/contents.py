@@ -39,7 +39,7 @@ OWN = {
         "-o results/tables/leaderboard_means.csv",
     ],
     "peers": [
-        "pip install 'estima[peers,tune]' && make peers",
+        "make setup EXTRAS=peers,tune && make peers",
         reproduce_command("peers"),
         "estima tune peers -o conf/estimator",
     ],

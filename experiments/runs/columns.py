@@ -63,12 +63,12 @@ OF_THE_RUN = {
 }
 _OF_THE_PATH = {
     "step_time_us": Column("time per step", "step", "µs", average=Average.FACTOR),
-    "ate_rmse_m": Column("position RMSE", "ATE", "m"),
+    "ate_rmse_m": Column("position RMSE", "RMSE", "m"),
     "ate_mean_m": Column("mean position error", "mean error", "m"),
-    "ate_aligned_rmse_m": Column("position RMSE after alignment", "ATE aligned", "m"),
+    "ate_aligned_rmse_m": Column("position RMSE after alignment", "RMSE aligned", "m"),
     "heading_rmse_rad": Column("heading RMSE", "heading", "rad"),
     "heading_aligned_rmse_rad": Column("heading RMSE after alignment", "heading aligned", "rad"),
-    "final_position_error_m": Column("final position error", "final ATE", "m"),
+    "final_position_error_m": Column("final position error", "final error", "m"),
     "final_heading_error_rad": Column("final heading error", "final heading", "rad"),
     "nees_counted_share": Column(
         "share of stamps with a usable covariance",
@@ -199,13 +199,13 @@ def title(name: str, *, short: bool = False) -> str:
     >>> title("ate_rmse_m"), title("choice.world"), title("sensors.stereo.max_distance_m")
     ('position RMSE, m', 'world', 'stereo max distance, m')
     >>> title("omega_radps"), title("ate_rmse_m_office"), title("recall_at_1_percent")
-    ('omega, rad/s', 'ATE (office), m', 'recall at 1, %')
+    ('omega, rad/s', 'RMSE (office), m', 'recall at 1, %')
     """
     if name in COLUMNS:
         column = COLUMNS[name]
         words, unit = column.symbol if short else column.label, column.unit
     elif name.startswith(RELATIVE):
-        words, unit = f"ATE / that of {name.removeprefix(RELATIVE)}", ""
+        words, unit = f"RMSE / that of {name.removeprefix(RELATIVE)}", ""
     elif "." in name:
         words, unit = _setting(name)
     elif metric := next((m for m in COLUMNS if name.startswith(f"{m}_")), ""):

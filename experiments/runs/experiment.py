@@ -15,6 +15,7 @@ from omegaconf import OmegaConf
 
 from estimators.base import Estimator
 from estimators.programs.host import Isolated
+from estimators.programs.offline import needs_of
 from experiments.runs import paths
 from experiments.runs.compose import open_composer
 from experiments.runs.key import origin_columns, run_key
@@ -37,6 +38,7 @@ from sim.options import build, find
 from sim.recording import Recording
 from sim.worlds import grid_file
 from sim.worlds.grid import OccupancyGrid
+from sim.worlds.world import World
 
 
 class Experiment(Objects):
@@ -202,14 +204,42 @@ class Experiment(Objects):
             return Isolated
         return self.own_estimator or check_target(self.config["estimator"], "estimator")
 
-    def _check_needs(self) -> None:
-        """Check that the estimator gets the sensors and the map that it needs."""
+    def _needs(self) -> frozenset[str]:
+        """Options that name a sensor the estimator cannot do without, and `map`."""
         settings = self.config["estimator"]
         estimator = self._named_estimator()
         if is_ours(settings):
             # its values too; one from elsewhere may take long to make
             estimator = self.with_values(isolated=False).estimator()
-        needs = frozenset(getattr(estimator, "needs", ()))
+        return frozenset(getattr(estimator, "needs", ()))
+
+    def _needs_stated(self) -> frozenset[str]:
+        """The same as its class states it, or a program's command: it need not be installed."""
+        stated = getattr(find(self.config["estimator"]["_target_"], "estimator"), "needs", ())
+        return needs_of(str(self.command)) if isinstance(stated, property) else frozenset(stated)
+
+    def sensors_needed(self) -> list[str]:
+        """Names of the sensors there are that the estimator cannot do without."""
+        settings, has = self.config["estimator"], self.config["sensors"]
+        names = [settings.get(o, o) for need in self._needs_stated() for o in need.split("|")]
+        return sorted(name for name in names if has.get(name) is not None)
+
+    def missing(self) -> list[str]:
+        """What the estimator needs and does not get, in words."""
+        needs, settings = self._needs_stated(), self.config["estimator"]
+        without = self._without(needs - {"map"}, settings)
+        words = [f"a sensor {' or '.join(names)}" for names in without]
+        kinds = getattr(find(settings["_target_"], "estimator"), "maps", None) or [World]
+        known_map = self.config["prior"]["map"]
+        if "map" in needs and World not in kinds and not isinstance(known_map, dict):
+            words.append("a topological map (prior.map._target_)")
+        elif "map" in needs and known_map == "none" and not settings.get("map_path"):
+            words.append("a map (prior.map=world)")
+        return words
+
+    def _check_needs(self) -> None:
+        """Check that the estimator gets the sensors and the map that it needs."""
+        settings, needs = self.config["estimator"], self._needs()
         if not self.from_file:
             self._check_sensors(f"estimator={self.estimator_name}", needs - {"map"}, settings)
             onboard = self.config["route"].get("feedback")
@@ -274,23 +304,24 @@ class Experiment(Objects):
 
     def _check_sensors(self, who: str, needs: Iterable[str], settings: Config) -> None:
         """Check that the robot has the sensors that an estimator needs."""
+        for names in self._without(needs, settings):
+            presets = [
+                path.stem
+                for path in sorted((paths.CONF / "sensors").glob("*.yaml"))
+                if OmegaConf.load(path).keys() & set(names)
+            ]
+            remedy = f"try sensors={', '.join(presets)}" if presets else f"add sensors.{names[0]}"
+            raise InputError(
+                f"{who} needs a sensor {' or '.join(names)}, and "
+                f"sensors={self.choices.get('sensors')} has none; {remedy}"
+            )
+
+    def _without(self, needs: Iterable[str], settings: Config) -> list[list[str]]:
+        """The sensors that are needed and not there: for each, the names that would do."""
         has = {name for name, sensor in self.config["sensors"].items() if sensor is not None}
-        for need in needs:
-            # an option of the estimator says how the sensor is called
-            names = [settings.get(option, option) for option in need.split("|")]
-            if has.isdisjoint(names):
-                presets = [
-                    path.stem
-                    for path in sorted((paths.CONF / "sensors").glob("*.yaml"))
-                    if OmegaConf.load(path).keys() & set(names)
-                ]
-                remedy = (
-                    f"try sensors={', '.join(presets)}" if presets else f"add sensors.{names[0]}"
-                )
-                raise InputError(
-                    f"{who} needs a sensor {' or '.join(names)}, and "
-                    f"sensors={self.choices.get('sensors')} has none; {remedy}"
-                )
+        # an option of the estimator says how the sensor is called
+        named = ([settings.get(option, option) for option in need.split("|")] for need in needs)
+        return [names for names in named if has.isdisjoint(names)]
 
 
 def rows_folder(name: Any) -> Path:

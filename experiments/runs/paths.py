@@ -1,8 +1,11 @@
 """Where the package keeps its own data, and where results go."""
 
+import itertools
 import os
 import re
 from pathlib import Path
+
+from sim.files import read_text
 
 TRUST = "ESTIMA_TRUST"  # set by --trust: data may name code
 SOURCE = Path(__file__).resolve().parents[2]  # the clone, or the site-packages of a wheel
@@ -30,6 +33,22 @@ def option_names(group: str, folder: Path | None = None) -> list[str]:
     """
     place = (folder or CONF) / group
     return sorted(p.relative_to(place).with_suffix("").as_posix() for p in place.rglob("*.yaml"))
+
+
+def about(file: Path) -> dict[str, str]:
+    """What the comment at the head of an option's YAML says.
+
+    Returns
+    -------
+    dict
+        `what` it is, the first sentence; and what it is `not_for`, the sentence after "Not for:".
+    """
+    lines = read_text(file).splitlines()
+    head = itertools.takewhile(lambda line: line.startswith("#"), lines)
+    words = " ".join(line.lstrip("# ") for line in head if "@package" not in line)
+    text, _, limits = words.partition(" Not for: ")
+    first = re.split(r"(?<!sec)\. +(?=[A-Z])", text, maxsplit=1)[0]  # not at "eqs. (1)"
+    return {"what": first.removesuffix("."), "not_for": limits}
 
 
 def results() -> Path:

@@ -43,7 +43,7 @@ from experiments.sweeps.work import (
     share_path,
 )
 from sim.compiled import ANNOUNCED, note_compiling
-from sim.errors import InputError, require
+from sim.errors import InputError, how_to_install, require
 from sim.files import require_file, write_text
 
 _JOBS_PER_CORE = 4  # enough to keep all busy to the end, few enough to cost little
@@ -311,7 +311,7 @@ def _check_launcher(launching: Sequence[str]) -> None:
         if chosen and importlib.util.find_spec(f"hydra_plugins.hydra_{plugin}_launcher") is None:
             raise InputError(
                 f"hydra/launcher={name} is an extra that is not installed: "
-                f"pip install -e .[{_EXTRAS[plugin]}]"
+                f"{how_to_install(_EXTRAS[plugin])}"
             )
 
 

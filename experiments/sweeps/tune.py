@@ -40,7 +40,7 @@ from experiments.sweeps.plan import plan_experiments
 from experiments.sweeps.ranges import FIRST_JUDGED_SEED, Range, Tuning
 from experiments.viewing.plotting import plain_log
 from experiments.viewing.style import SERIES, save_figure, subplots
-from sim.errors import InputError, require
+from sim.errors import InputError, how_to_install, require
 from sim.files import write_text
 from sim.options import build
 
@@ -407,6 +407,6 @@ def _optuna() -> Any:
     try:
         import optuna
     except ImportError as error:
-        raise InputError(f"tuning needs Optuna ({error}); pip install 'estima[tune]'") from error
+        raise InputError(f"tuning needs Optuna ({error}); {how_to_install('tune')}") from error
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     return optuna

@@ -34,7 +34,7 @@ from typing import Any
 import numpy as np
 
 from sim.arrays import Array, Ints
-from sim.errors import InputError
+from sim.errors import InputError, how_to_install
 from sim.sensors.base import Field, Reading, Schema, Sensors
 
 ABOUT = "/estima/about"
@@ -76,7 +76,7 @@ def library() -> None:
     try:
         import rosbags.rosbag2  # noqa: F401
     except ImportError:
-        raise InputError("bags need the library rosbags: install estima[ros]") from None
+        raise InputError(f"bags need the library rosbags: {how_to_install('ros')}") from None
 
 
 def typestore(*, ros1: bool) -> Any:

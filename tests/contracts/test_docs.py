@@ -9,8 +9,12 @@ from pathlib import Path
 import pytest
 
 import estima
+from estimators.on_a_map.mcl import Mcl
+from experiments.cli.main import _COMMANDS
+from experiments.judging.folders import code_folder
 from experiments.papers.puzzlebot2024 import study as puzzlebot2024
 from experiments.runs.paths import option_names
+from sim.options import described
 
 # studies of questions of ours, beyond the parts of the papers
 NOT_OF_A_PART = {
@@ -63,6 +67,41 @@ def test_it_has_a_page_for_every_document(site):
     for page in (ROOT / "docs").glob("*.md"):
         place = folder / ("" if page.stem == "index" else page.stem)
         assert (place / "index.html").exists(), page.name
+
+
+def test_each_command_and_estimator_has_its_place(site):
+    commands = (site[0] / "reference" / "commands" / "index.html").read_text()
+    for name in _COMMANDS:
+        assert f'id="estima-{name}"' in commands, name
+    for name in option_names("estimator"):
+        if not name.endswith("_tuned"):
+            page = site[0] / "reference" / "estimators" / name.replace("/", "_") / "index.html"
+            text = page.read_text()
+            assert "<strong>Not for</strong>" in text, name
+            assert f"estima options {name}" in text
+    mcl = (site[0] / "reference" / "estimators" / "mcl" / "index.html").read_text()
+    for option in described(Mcl):
+        assert f"estimator.{option.name}<" in mcl
+    assert "mcl_tuned" in mcl.partition("On the boards")[2]
+
+
+def test_each_key_is_in_the_reference(site):
+    page = (site[0] / "reference" / "configuration" / "index.html").read_text()
+    for key in ("simulation.rays", "prior.map", "team.size", "robot.kr", "route.distance_m"):
+        assert f"<code>{key}</code>" in page, key
+    for group in ("world", "robot", "sensors", "route"):
+        for name in option_names(group):
+            assert f"<code>{group}={name}</code>" in page, name
+
+
+def test_the_gallery_has_every_figure_and_what_makes_it(site):
+    page = (site[0] / "gallery" / "index.html").read_text()
+    for figure in (ROOT / "results" / "figures").glob("*.png"):
+        assert f"{figure.name}" in page, figure.name
+    for study in set(re.findall(r"estima reproduce --paper (\w+)", page)):
+        assert code_folder(study).is_dir(), study
+    for study in set(re.findall(r"-m study=([\w/]+)", page)):
+        assert study in option_names("study"), study
 
 
 def test_it_documents_the_api(site):

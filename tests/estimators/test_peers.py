@@ -40,7 +40,7 @@ def off_m(recording, means):
 def test_a_missing_package_is_told_in_one_line(name, monkeypatch):
     monkeypatch.setitem(sys.modules, name, None)
     for estimator in PACKAGES[name]:
-        with pytest.raises(MissingPackageError, match=r"pip install 'estima\[(peers|gtsam)\]'"):
+        with pytest.raises(MissingPackageError, match=r"make setup EXTRAS=(peers|gtsam)"):
             estimator()
 
 

@@ -83,7 +83,7 @@ def mrclam(errors: pd.DataFrame, paths: Arrays) -> Figure:
         middle.plot(at, rows.nees_mean.median(), "o", ms=4, color=color)
     ticks = {"xticks": range(len(robots)), "xticklabels": [f"R{robot}" for robot in robots]}
     left.set(
-        ylabel="ATE after 300 s, from the true start, m",
+        ylabel="position RMSE after 300 s, from the true start, m",
         ylim=(0.0, None),
         title="MRCLAM 6",
         **ticks,

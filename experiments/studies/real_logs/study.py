@@ -126,7 +126,7 @@ def _landmark_rows(run: Experiment, method: str, robot: int, seed: int) -> Table
 
 
 def rawseeds_ate() -> pd.DataFrame:
-    """ATE of the stored trajectories beside the printed figures."""
+    """Position RMSE of the stored trajectories beside the printed figures."""
     members = read_members(DATA / "rawseeds_bicocca_reference/rawseeds_bicocca_25a_25b.tar.xz")
 
     def trajectory(session: str, name: str) -> tuple[Array, Array]:

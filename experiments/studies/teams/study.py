@@ -121,7 +121,7 @@ def drive(seed: int) -> dict[str, Array]:
 
 
 def mrclam_rows(log: Path, n_frames: int | None = None) -> list[Row]:
-    """ATE of each robot of MRCLAM 6 by EKF-SLAM: alone, in a team, and in one with sightings.
+    """Errors of each robot of MRCLAM 6 by EKF-SLAM: alone, in a team, and in one with sightings.
 
     The robots are calibrated as in the study of single robots, on the stretch that is not scored,
     and the same is believed of their slip, noise and gates.

@@ -332,8 +332,8 @@ def test_conform_runs_by_name():
 
 
 def test_a_users_own_estimator(tmp_path):
-    """One Python file and one YAML, anywhere on disk: the example of the README."""
-    text = (ROOT / "README.md").read_text()
+    """One Python file and one YAML, anywhere on disk: the example of the tutorial."""
+    text = (ROOT / "docs" / "tutorial.md").read_text()
     code = text.split("```python\n")[1].split("```")[0]
     options = text.split("```yaml\n")[1].split("```")[0]
     (tmp_path / "mine.py").write_text(code)

@@ -379,7 +379,7 @@ def test_a_wide_table_scrolls_in_its_own_box(tab):
 def test_tables_are_sorted_by_keyboard(tab):
     head = "document.querySelectorAll('table.sortable th button')"
     assert tab.js(f"{head}.length") > 4
-    at = tab.js(f"[...{head}].findIndex(b => b.textContent.startsWith('ATE'))")
+    at = tab.js(f"[...{head}].findIndex(b => b.textContent.startsWith('RMSE'))")
     tab.js(f"{head}[{at}].focus()")
     rows_of = "[...document.querySelectorAll('.sortable tbody tr')]"
     cells = f"{rows_of}.map(r => parseFloat(r.cells[{at}].textContent))"

@@ -108,7 +108,7 @@ def test_a_sweep_shows_its_small_table_and_what_comes_next(tmp_path):
     overrides = ["route=linear_1", "seed=0,1", "name=small", "hydra/launcher=basic"]
     done = estima("run", "-m", *QUICK, *overrides, ESTIMA_RESULTS=str(tmp_path))
     assert done.returncode == 0, done.stderr
-    assert "ATE, m" in done.stdout
+    assert "RMSE, m" in done.stdout
     assert "estima report small" in done.stdout
     command = (tmp_path / "runs" / "small" / "command.txt").read_text()
     assert command.startswith("estima run -m ")

@@ -138,7 +138,7 @@ def test_a_table_too_wide_for_the_text_becomes_several_of_the_same_rows(tmp_path
     write_table(wide(), "note", tmp_path / "t.tex", "mine")
     text = (tmp_path / "t.tex").read_text()
     assert check_latex(text) == [3, 3, 3]  # the name has two lines
-    assert text.count("ATE, m") == text.count(r"step, $\mu$s") == 1
+    assert text.count("RMSE, m") == text.count(r"step, $\mu$s") == 1
     assert len(re.findall(r"(?m)^a & ", text)) == 3
     write_table(wide(), "note", tmp_path / "page.tex", "mine", "page")
     assert check_latex((tmp_path / "page.tex").read_text()) == [3, 3]
@@ -225,7 +225,7 @@ def test_tables_are_written_for_papers_and_pages(tmp_path):
     assert check_latex(texts[".tex"]) == [2]
     assert r"\textbf{" in texts[".tex"]
     assert r"\times 10^{-5}" in texts[".tex"]
-    assert "ATE, m" in texts[".tex"]
+    assert "RMSE, m" in texts[".tex"]
     assert r"\textless{}b\textgreater{}\&\%\_\#\textasciicircum{}w" in texts[".tex"]
     assert len(re.findall(r"\*\*[\d.e-]+\*\* \[", texts[".md"])) == 1
     assert r"\<b>\&%\_#^w" in texts[".md"]

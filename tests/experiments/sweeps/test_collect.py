@@ -383,7 +383,7 @@ def test_columns_say_their_unit():
         unit = name.rpartition("_")[2] if column.unit else ""
         assert column.unit.replace("µ", "u").replace("²", "2") == unit
         assert title(name).endswith(column.unit)
-    assert title("ate_rmse_m", short=True) == "ATE, m"
+    assert title("ate_rmse_m", short=True) == "RMSE, m"
     page = sweep_figure(rows(), "robot.kr", "ate_rmse_m", pool=True)
     assert page.axes[0].get_ylabel() == "position RMSE, m"
     assert page.axes[0].get_xlabel() == "true kr, m"

@@ -188,7 +188,7 @@ def test_what_does_not_fit_the_estimator_is_told_before_any_run(study, tmp_path)
 
 def test_without_optuna_it_says_so(monkeypatch):
     monkeypatch.setitem(sys.modules, "optuna", None)
-    with pytest.raises(InputError, match=r"pip install 'estima\[tune\]'"):
+    with pytest.raises(InputError, match=r"make setup EXTRAS=tune"):
         list(tuning.tune("peers"))
 
 

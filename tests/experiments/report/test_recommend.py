@@ -1,0 +1,69 @@
+"""`estima recommend`: what fits, where it was measured, and what to run."""
+
+import re
+
+import pytest
+
+from experiments.report import recommend as module
+from experiments.report.recommend import recommend
+from experiments.runs import paths
+from sim.errors import InputError
+
+SENSORS = {
+    "laser": ["sensors=hokuyo", "robot.kr=2e-5"],
+    "landmarks": ["sensors=stereo_pixel"],
+    "map": ["sensors=hokuyo", "prior.map=world", "world=office"],
+    "wheels": [],
+}
+FIT = {  # some that fit, and some that do not
+    "laser": ({"odometry", "ekf_icp", "graph_slam", "mrpt_icp"}, {"mcl", "smoother", "mrpt_mcl"}),
+    "landmarks": ({"odometry", "smoother", "gtsam_batch"}, {"ekf_icp", "mcl", "kiss_icp"}),
+    "map": ({"mcl", "mcl_tuned", "ekf_icp", "mrpt_mcl"}, {"ekf_slam", "topological_mcl"}),
+    "wheels": ({"odometry"}, {"ekf_icp", "mcl", "smoother", "kiss_icp", "topological_mcl"}),
+}
+
+
+@pytest.fixture(autouse=True)
+def no_results_here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("which", FIT)
+def test_what_fits_is_named_with_where_it_was_measured(which):
+    text, sweep = recommend(SENSORS[which])
+    fits = set(re.search(r"Fits: (.*)\.", text)[1].split(", "))
+    good, bad = FIT[which]
+    assert good <= fits
+    assert not bad & fits
+    measured = re.findall(r"^  (\w+) +position RMSE ([\d.]+) mm", text, re.MULTILINE)
+    assert "odometry" in dict(measured)
+    assert {name for name, _ in measured} <= fits
+    assert "Nearest judged setting: study=" in text
+    assert sweep[: len(SENSORS[which])] == SENSORS[which]
+    (tried,) = [word.partition("=")[2] for word in sweep if word.startswith("estimator=")]
+    assert set(tried.split(",")) <= fits
+
+
+def test_a_wheel_has_no_tables_and_says_so(tmp_path, monkeypatch):
+    monkeypatch.setattr(paths, "SOURCE", tmp_path)
+    monkeypatch.setattr(paths, "option_names", lambda group: ["odometry", "mcl"])
+    text, sweep = recommend([])
+    assert "No tables of results are here" in text
+    assert "Fits: odometry." in text
+    assert "Needs a sensor laser and a map (prior.map=world): mcl." in text
+    assert "estimator=odometry" in sweep
+
+
+def test_wrong_overrides_are_refused():
+    with pytest.raises(InputError, match="leave the estimator out"):
+        recommend(["estimator=mcl"])
+    with pytest.raises(InputError, match=r"robot\.kr must be"):
+        recommend(["robot.kr=-1.0"])
+
+
+def test_distance_counts_decades_and_choices():
+    row = module.Judged("s", "e", {"robot.kr": 1e-4, "world": "room"}, 0.1, 0.1, 0.1, 1)
+    asked = {"robot.kr": 1e-6, "world": "office"}
+    assert module._changes(asked, row, ["robot.kr", "world"]) == {"robot.kr": 2.0, "world": 1.0}
+    assert module._changes(dict(row.setting), row, ["robot.kr", "world"]) == {}
