@@ -1,8 +1,8 @@
 """A smooth surface over settings: the mean of a Gaussian process with a length for each setting.
 
 Chosen by its error on seven planted functions (linear, stepped, bent, crossed; three and five
-settings, 64 points): where the function has a step it errs half to an eighth of what a quadratic with ridge
-does. The quadratic is better where there is no effect, and on one bent function at high noise.
+settings, 64 points): where the function has a step it errs half to an eighth of what a quadratic
+with ridge does. The quadratic is better without an effect, and on one bent function at high noise.
 """
 
 from dataclasses import dataclass
