@@ -119,7 +119,7 @@ def test_messages_are_made_printable(small):
     then = now.assign(status="ok", **dict.fromkeys(ERRORS, 1.0))
     found = regress.compare({"accepted": then}, raw)
     assert regress.compare({"accepted": then}, now)[0].message == found[0].message.translate(
-        {0: "?", 0x1B: "?", 0x85: "?", 0xFFFE: "?", 13: "?"}
+        {0: "?", 0x1B: "?", 0x85: "?", 0xFFFE: "?", 13: " "}
     )
     failures = ET.fromstring(regress_report.as_junit(found)).findall(".//failure")
     assert len(failures) == 3
