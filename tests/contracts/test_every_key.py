@@ -119,7 +119,7 @@ def idle_keys(base, places, digests, option=""):
         kinds = kinds_of(place, settings)
         for leaf, _ in leaves({"": settings}):
             key = ".".join((place, *leaf[1:]))
-            if leaf[-1] == "_target_" or key in NO_RESULT:
+            if leaf[-1] == "_target_" or {key, f"{option} {key}"} & NO_RESULT.keys():
                 continue
             experiment, usual = case(tuple(ACTS.get(f"{option} {key}", ACTS.get(key, ()))))
             kind = kinds.get(leaf[1]) if len(leaf) > 1 else None
