@@ -125,7 +125,8 @@ def judged_claims(
     `sentence` on what came out.
     """
     sentences = verdicts["sentence"].to_dict()
-    by_region = verdicts.loc[verdicts["region_share"].notna(), "verdict"].map(Verdict).to_dict()
+    decided = verdicts.loc[verdicts["region_share"].notna(), "verdict"]
+    by_region = {key: Verdict(text) for key, text in decided.items()}
     says = {key: text for page in about.values() for key, text in page["claims"].items()}
     own = {key for page in about.values() for key in page["own"]}
     rows: dict[str, list[Entry]] = {key: [] for key in says}
