@@ -101,8 +101,10 @@ def test_a_drawn_history_names_its_commit():
 @pytest.mark.slow
 @pytest.mark.parametrize("rise", [0.05, 0.10])
 def test_the_wrong_commit_is_blamed_in_1_of_100_searches(rise):
+    every = []
     for kind in material()[1]:
         found = [named(kind, math.log1p(rise), seed) for seed in range(100)]
         searched = [right for right in found if right is not None]
         print(f"{kind} {rise:.0%} worse: {sum(searched)} of {len(searched)} searches right")
-        assert sum(searched) >= 0.97 * len(searched)
+        every += searched
+    assert sum(every) >= 0.97 * len(every)
