@@ -98,6 +98,10 @@ def test_a_drawn_history_names_its_commit():
     assert named("mcl", math.log(1.1), 0)
 
 
+# 12 of 13 right: the ends of so few of its histories are red that one wrong search fails the bound
+SELDOM_FOUND = {("fastslam_paper", 0.05)}
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("rise", [0.05, 0.10])
 def test_the_wrong_commit_is_blamed_in_1_of_100_searches(rise):
@@ -107,4 +111,6 @@ def test_the_wrong_commit_is_blamed_in_1_of_100_searches(rise):
         searched = [right for right in found if right is not None]
         print(f"{kind} {rise:.0%} worse: {sum(searched)} of {len(searched)} searches right")
         every += searched
+        if (kind, rise) not in SELDOM_FOUND:
+            assert sum(searched) >= 0.97 * len(searched)
     assert sum(every) >= 0.97 * len(every)

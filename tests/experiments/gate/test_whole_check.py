@@ -1,5 +1,6 @@
 """How often a whole check errs, over many checks resampled from the tracked baselines' rows."""
 
+import itertools
 import math
 from functools import cache
 from itertools import permutations
@@ -117,12 +118,18 @@ def test_a_drawn_check_is_one_of_all_methods(neutral):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("neutral", [0.1, 1.0])
-@pytest.mark.parametrize("n_estimators", [14, 100, 500])
+@pytest.mark.parametrize(
+    ("n_estimators", "neutral"),
+    [
+        *itertools.product((14, 100), (0.1, 1.0)),
+        (500, 0.1),
+        pytest.param(500, 1.0, marks=pytest.mark.xfail(run=False, reason="2.3 % [1.7, 3.1]")),
+    ],
+)
 def test_false_alarms_of_a_whole_check(n_estimators, neutral):
-    share = alarms(N_CHECKS if n_estimators < 500 else 200, n_estimators, neutral=neutral)
+    share = alarms(N_CHECKS, n_estimators, neutral=neutral)
     print(f"{n_estimators} estimators, {neutral:.0%} changed neutrally: {share}")
-    assert share.low <= GOAL  # of 500, all changed neutrally: 2.3 % [1.7, 3.1]
+    assert share.value <= GOAL
 
 
 @pytest.mark.slow
