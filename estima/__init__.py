@@ -222,7 +222,7 @@ def run(*given: Any, estimator: str | Estimator | None = None) -> Run:
     (0.0001, True)
     >>> estima.run(*quick, estimator="ekf_icp")
     Traceback (most recent call last):
-    sim.errors.InputError: estimator=ekf_icp needs a sensor laser, and sensors=encoder has none; try sensors=hokuyo, laser_stereo, laser_stereo_lidar3d, lms291, real_laser
+    sim.errors.InputError: estimator=ekf_icp needs a sensor laser, and sensors=encoder has none; try sensors=hokuyo, laser_stereo, laser_stereo_lidar3d, lms291, lms291_degree, lms291_quarter, real_laser, rplidar_a1, urg04lx, utm30lx
     """  # noqa: E501 the message is one line
     from experiments.runs.evaluate import evaluate
     from sim.errors import require

@@ -242,8 +242,10 @@ def _judged_items(made: Results) -> tuple[Items, list[Claim], list[Conclusion]]:
 
 def judgement(made: Results) -> tuple[list[Claim], list[Conclusion]]:
     """Statistics of a paper's claims by its tables, and the one verdict on each claim."""
-    claims = _part(made.paper, "claims").judge(made)
-    return claims, conclude(claims, findings(made.paper))
+    part = _part(made.paper, "claims")
+    claims = part.judge(made)
+    regions = part.regions(made) if hasattr(part, "regions") else {}
+    return claims, conclude(claims, findings(made.paper), regions)
 
 
 def _write(

@@ -44,7 +44,7 @@ def describe_unknown(key: str, known: Iterable[str], where: str = "") -> str:
     'unknown key prior.sart; known: prior.start, prior.map'
     """
     names, place = list(known), f"{where}." if where else ""
-    near = difflib.get_close_matches(key, names, n=3)
+    near = difflib.get_close_matches(str(key), names, n=3)  # a file's may be any value
     listed = [f"{place}{name}" for name in dict.fromkeys([*near, *names])]
     return f"unknown key {place}{key}; known: {', '.join(listed) or 'none'}"
 

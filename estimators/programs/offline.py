@@ -3,7 +3,6 @@
 The log is made of the Frames and the Prior, so it holds neither the truth nor where it came from.
 """
 
-import re
 import tempfile
 from collections.abc import Callable, Sequence
 from functools import cached_property
@@ -14,6 +13,7 @@ import numpy as np
 import orjson
 
 from estimators.base import Belief, Estimate, Prior
+from estimators.programs.places import NAMES, fill, needs_of, places_in
 from estimators.programs.program import (
     Program,
     ProgramError,
@@ -38,19 +38,7 @@ from sim.worlds.world import World
 
 Output = Literal["tum", "mcap", "bag"]
 Kind = Literal["revised", "online"]
-_PLACES = ("log", "mcap", "npz", "map", "grid", "start", "seed", "out")
-_NEEDED_BY = {"laser": ("log", "grid"), "map": ("map", "grid")}
 _CELL_M = 0.05  # of a world's {grid}
-
-
-def _places_in(command: str) -> set[str]:
-    return set(re.findall(r"\{(\w+)\}", command))
-
-
-def needs_of(command: str) -> frozenset[str]:
-    """The sensors, and `map`, from which the files that a command names are made."""
-    places = _places_in(command)
-    return frozenset(need for need, of in _NEEDED_BY.items() if places.intersection(of))
 
 
 @options("estimator")
@@ -70,10 +58,10 @@ class OfflineOptions(ProgramOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        known = ", ".join(f"{{{place}}}" for place in _PLACES)
+        known = ", ".join(f"{{{place}}}" for place in NAMES)
         for name in self.places:
             require(
-                name in _PLACES,
+                name in NAMES,
                 f"estimator.command: nothing is called {{{name}}}; known: {known}",
             )
         require("out" in self.places, "estimator.command must have {out}, the file it writes")
@@ -81,7 +69,7 @@ class OfflineOptions(ProgramOptions):
     @cached_property
     def places(self) -> set[str]:
         """Names of files in the command."""
-        return _places_in(" ".join(self.words))
+        return places_in(" ".join(self.words))
 
     @property
     def needs(self) -> frozenset[str]:
@@ -121,7 +109,7 @@ class Offline(OfflineOptions):
         """Write the log, run the command, and read its trajectory."""
         with tempfile.TemporaryDirectory(prefix="estima-") as name:
             places = self._written(Path(name))
-            program = Program([_filled(word, places) for word in self.words])
+            program = Program([fill(word, places) for word in self.words])
             try:
                 program.wait(self.limit_s)
             finally:
@@ -174,10 +162,6 @@ class Offline(OfflineOptions):
             write_text(path, text.decode())
 
         return "map.json", write
-
-
-def _filled(word: str, places: dict[str, str]) -> str:
-    return re.sub(r"\{(\w+)\}", lambda found: places[found[1]], word)
 
 
 def start_text(prior: Prior) -> str:

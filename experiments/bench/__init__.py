@@ -25,8 +25,13 @@ SUITES = {
 }
 
 
-def run_bench(name: str, *, as_json: bool) -> str:
+def run_bench(name: str, *, as_json: bool, against: str | None = None) -> str:
     """Run one suite, or `all`; return the results as a table or as one JSON object.
+
+    Parameters
+    ----------
+    against
+        A git revision that runs in turn, to give each figure its ratio.
 
     Raises
     ------
@@ -34,11 +39,16 @@ def run_bench(name: str, *, as_json: bool) -> str:
         For an unknown name.
     """
     require(name in (*SUITES, "all"), f"unknown benchmark {name}; known: {', '.join(SUITES)}, all")
-    results = [
-        result
-        for suite, modules in SUITES.items()
-        if name in (suite, "all")
-        for module in modules
-        for result in importlib.import_module(f"experiments.bench.{module}").run()
-    ]
+    suites = [suite for suite in SUITES if name in (suite, "all")]
+    if against is not None:
+        from experiments.bench.against import run_against
+
+        results = [result for suite in suites for result in run_against(suite, against)]
+    else:
+        results = [
+            result
+            for suite in suites
+            for module in SUITES[suite]
+            for result in importlib.import_module(f"experiments.bench.{module}").run()
+        ]
     return json_text(results) if as_json else as_table(results)

@@ -11,8 +11,11 @@ from dataclasses import dataclass
 from multiprocessing import get_context
 from typing import Any, Literal, TypeVar
 
+import numpy as np
+
 from estimators.base import Belief, Estimator
 from experiments.runs.version import describe_machine
+from sim.compiled import njit, processor_s
 from sim.recording import Frame
 
 T = TypeVar("T")
@@ -34,6 +37,8 @@ class Measurement:
         Which direction is better.
     note
         How it was measured, in a few words.
+    ratio, ratio_low, ratio_high
+        To another revision's figure, measured in turn, with its 95 % interval.
     """
 
     name: str
@@ -42,6 +47,9 @@ class Measurement:
     goal: float | None = None
     better: Literal["lower", "higher"] = "lower"
     note: str = ""
+    ratio: float | None = None
+    ratio_low: float | None = None
+    ratio_high: float | None = None
 
     @property
     def reached(self) -> bool | None:
@@ -115,11 +123,37 @@ def time_steps(estimator: Estimator, frames: Iterable[Frame]) -> Iterator[tuple[
         yield time.process_time() - begun, belief
 
 
+@njit()
+def _logistic(n: int) -> float:
+    """A chain of dependent operations, which no compiler can shorten."""
+    x = 0.3
+    for _ in range(n):
+        x = 3.9 * x * (1.0 - x)
+    return x
+
+
+def machine_unit_ms() -> dict[str, float]:
+    """Processor time of three small pieces of work, to read figures of two machines by.
+
+    A product of matrices by NumPy, a copy of 32 MiB, and a compiled loop.
+    """
+    matrix, block = np.full((256, 256), 0.5), np.ones(2**22)
+    work: dict[str, Callable[[], object]] = {
+        "numpy": lambda: matrix @ matrix,
+        "memory": lambda: np.copyto(copy, block),
+        "compiled": lambda: _logistic(100_000),
+    }
+    copy = np.empty_like(block)
+    return {
+        name: 1e3 * median_time_s(call, at_least_s=0.05, clock=processor_s)
+        for name, call in work.items()
+    }
+
+
 def as_json(results: list[Measurement]) -> str:
-    """One object: the machine, and the results in order."""
-    return json.dumps(
-        {"machine": describe_machine(), "results": [vars(r) for r in results]}, indent=2
-    )
+    """One object: the machine, its unit, and the results in order."""
+    machine = {"machine": describe_machine(), "machine_unit_ms": machine_unit_ms()}
+    return json.dumps({**machine, "results": [vars(r) for r in results]}, indent=2)
 
 
 def as_table(results: list[Measurement]) -> str:
@@ -131,6 +165,7 @@ def as_table(results: list[Measurement]) -> str:
         Column("name", no_wrap=True),
         Column("value", justify="right", no_wrap=True),
         Column("goal", justify="right", no_wrap=True),
+        *([Column("ratio", no_wrap=True)] if (paired := any(r.ratio for r in results)) else []),
         *("unit", "", "note"),
         title=", ".join(f"{key} {value}" for key, value in describe_machine().items()),
     )
@@ -138,7 +173,9 @@ def as_table(results: list[Measurement]) -> str:
     for r in results:
         sign = "<=" if r.better == "lower" else ">="
         goal = "" if r.goal is None else f"{sign} {r.goal:g}"
-        table.add_row(r.name, f"{r.value:.4g}", goal, r.unit, words[r.reached], r.note)
+        ratio = f"{r.ratio:.3f} ({r.ratio_low:.3f} to {r.ratio_high:.3f})" if r.ratio else ""
+        cells = [r.name, f"{r.value:.4g}", goal, *([ratio] if paired else [])]
+        table.add_row(*cells, r.unit, words[r.reached], r.note)
     text = io.StringIO()
     Console(file=text, width=120).print(table)
     return text.getvalue().rstrip()

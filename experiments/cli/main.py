@@ -85,6 +85,7 @@ _COMMANDS: dict[str, Callable[..., None]] = {  # as `estima --help` lists them
     "tune": run.tune,
     "conform": score.conform,
     "check": project.check,
+    "bisect": project.bisect,
     "bench": project.bench,
     "table": tables.table,
     "plot": tables.plot,

@@ -1,13 +1,15 @@
-"""Commands on the project: check, reproduce, bench, cache."""
+"""Commands on the project: check, bisect, reproduce, bench, cache."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from experiments.cli import completion
+from experiments.cli.flags import ConfigDir, gathered
 from experiments.runs import paths
 from sim.errors import require
 
@@ -101,14 +103,22 @@ def bench(
         ),
     ] = "all",
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    against: Annotated[
+        str | None,
+        typer.Option(help="A git revision that runs in turn with this code; gives ratios to it."),
+    ] = None,
 ) -> None:
     """Measure speeds and accuracies on one core, beside their goals.
 
-    Example: estima bench sim --json
+    Examples
+    --------
+      estima bench sim --json
+
+      estima bench fastslam --against v0.2
     """
     from experiments.bench import run_bench
 
-    print(run_bench(name, as_json=as_json))
+    print(run_bench(name, as_json=as_json, against=against))
 
 
 def cache(
@@ -129,6 +139,29 @@ def cache(
     print(f"{paths.short(folder())}: {len(kept)} recordings, {size:.2f} of {limit:g} GiB")
 
 
+@dataclass(frozen=True)
+class Reports:
+    """What a check writes."""
+
+    junit: Annotated[Path | None, typer.Option(help="JUnit XML to write.")] = None
+    summary: Annotated[Path | None, typer.Option(help="Markdown to write.")] = None
+
+
+@dataclass(frozen=True)
+class Elsewhere:
+    """Trajectories that were made elsewhere."""
+
+    candidate: Annotated[
+        Path | None,
+        typer.Option(help="Folder of trajectories that were made elsewhere, to judge instead."),
+    ] = None
+    recordings: Annotated[
+        Path | None,
+        typer.Option(help="Only write the recordings for them, without the truth, to this folder."),
+    ] = None
+
+
+@gathered
 def check(
     suite: Annotated[
         str,
@@ -150,15 +183,13 @@ def check(
     release: Annotated[
         bool, typer.Option("--release", help="With --accept: pin the release baseline too.")
     ] = False,
-    junit: Annotated[Path | None, typer.Option(help="JUnit XML to write.")] = None,
-    summary: Annotated[Path | None, typer.Option(help="Markdown to write.")] = None,
-    candidate: Annotated[
-        Path | None,
-        typer.Option(help="Folder of trajectories that were made elsewhere, to judge instead."),
-    ] = None,
-    recordings: Annotated[
-        Path | None,
-        typer.Option(help="Only write the recordings for them, without the truth, to this folder."),
+    *,
+    reports: Reports,
+    elsewhere: Elsewhere,
+    config_dir: ConfigDir = None,
+    speed: Annotated[
+        str | None,
+        typer.Option(help="Only compare the times of steps with those at this git revision."),
     ] = None,
 ) -> None:
     """Compare all estimators' errors with the baseline; code 1 if one is worse.
@@ -171,21 +202,67 @@ def check(
     --------
       estima check
 
+      estima check --speed v0.2
+
       estima check --junit check.xml
 
       estima check --accept "descriptors of half the size: 2 % worse, twice as fast"
+
+      estima check --suite mine.yaml --config-dir mine
 
       estima check --suite mine.yaml --recordings in
 
       estima check --suite mine.yaml --candidate out
     """
-    if recordings is not None:
+    if elsewhere.recordings is not None:
         from experiments.gate.candidate import export_recordings
 
-        print(export_recordings(suite, only or [], recordings))
+        print(export_recordings(suite, only or [], elsewhere.recordings))
+        return
+    if speed is not None:
+        from experiments.gate.speed import run_speed
+
+        if run_speed(suite, speed, only or [], config_dir):
+            raise typer.Exit(1)
         return
     from experiments.gate.report import run_check
 
-    reports = {"junit": junit, "summary": summary}
-    if run_check(suite, accept, only or [], release=release, candidate=candidate, **reports):
+    worse = run_check(
+        suite,
+        accept,
+        only or [],
+        release=release,
+        candidate=elsewhere.candidate,
+        config_dir=config_dir,
+        **vars(reports),
+    )
+    if worse:
         raise typer.Exit(1)
+
+
+def bisect(
+    good: Annotated[str, typer.Argument(help="A git revision at which nothing was worse.")],
+    bad: Annotated[str, typer.Argument(help="A later one, at which something is.")] = "HEAD",
+    suite: Annotated[
+        str,
+        typer.Option(
+            help="Suite of conf/suite, or a .yaml file.", autocompletion=completion.suites
+        ),
+    ] = "check",
+    only: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="An estimator; repeat it. Else all of the suite.",
+            autocompletion=completion.estimators,
+        ),
+    ] = None,
+) -> None:
+    """Find the commit that made an estimator's errors worse.
+
+    Every revision that is checked is a worktree in the cache of the results' folder.
+
+    Example: estima bisect v0.2 --only fastslam
+    """
+    from experiments.gate.bisect import run_bisect
+
+    run_bisect(good, bad, suite, only or [])

@@ -162,6 +162,7 @@ def check(
     only: Sequence[str] = (),
     on_progress: Callable[[float], None] = lambda _: None,
     candidate: Path | None = None,
+    config_dir: Path | None = None,
 ) -> list[Finding]:
     """Run a suite, or some of its estimators, and compare it with its baselines.
 
@@ -169,13 +170,16 @@ def check(
     ----------
     candidate
         Folder of trajectories that were made elsewhere, to judge in place of a run.
+    config_dir
+        A further folder of options, such as those of estimators of one's own.
 
     Raises
     ------
     InputError
         If the suite or a baseline cannot be used.
     """
-    suite = read_suite(suite_path(suite_name)).select(only).made(elsewhere=candidate is not None)
+    whole = read_suite(suite_path(suite_name), config_dir)
+    suite = whole.select(only).made(elsewhere=candidate is not None)
     baselines = {
         key: read_baseline(path).rows
         for key, path in baseline_paths(suite_name).items()
@@ -192,6 +196,7 @@ def accept(
     release: bool = False,
     on_progress: Callable[[float], None] = lambda _: None,
     candidate: Path | None = None,
+    config_dir: Path | None = None,
 ) -> AcceptedBaseline:
     """Run a suite and make it the baseline, with the reason written into the file.
 
@@ -199,7 +204,7 @@ def accept(
     unless there is none, or `release` pins it to this too.
     """
     require(reason.strip(), "accepting needs a reason, such as 'faster matching, 2 % worse'")
-    whole = read_suite(suite_path(suite_name))
+    whole = read_suite(suite_path(suite_name), config_dir)
     suite = whole.select(only).made(elsewhere=candidate is not None)
     names = [entry.name for entry in suite.estimators]
     paths = baseline_paths(suite_name)

@@ -12,7 +12,7 @@ import pandas as pd
 
 from experiments.gate.baseline import accept, baseline_folder, baseline_paths, check, is_main
 from experiments.gate.compare import Change, Finding
-from experiments.gate.suite import command_of, draw_run, read_suite, suite_path
+from experiments.gate.suite import Suite, command_of, draw_run, read_suite, suite_path
 from experiments.report.export import escape_markdown, to_markdown
 from experiments.runs.columns import COLUMNS
 from experiments.runs.console import progress, show, warn
@@ -37,12 +37,19 @@ def run_check(
     junit: Path | None = None,
     summary: Path | None = None,
     candidate: Path | None = None,
+    config_dir: Path | None = None,
 ) -> bool:
     """Do what `estima check` does; return whether it found a worsening."""
     if reason is not None:
         with progress("checking the estimators", 1.0) as on_progress:
             accepted = accept(
-                suite, reason, only, release=release, on_progress=on_progress, candidate=candidate
+                suite,
+                reason,
+                only,
+                release=release,
+                on_progress=on_progress,
+                candidate=candidate,
+                config_dir=config_dir,
             )
         show(as_text(accepted.findings, hint=""))
         for path in accepted.written:
@@ -70,9 +77,9 @@ def run_check(
             "up unseen; pin one with --accept REASON --release"
         )
     with progress("checking the estimators", 1.0) as on_progress:
-        findings = check(suite, only, on_progress, candidate)
+        findings = check(suite, only, on_progress, candidate, config_dir)
     show(as_text(findings, detectable, hint=_hint(suite, findings)))
-    show(_where_to_look(suite, findings))
+    show(_where_to_look(read_suite(suite_path(suite), config_dir), findings))
     if junit is not None:
         write_text(junit, as_junit(findings))
     if summary is not None:
@@ -126,10 +133,9 @@ def _hint(suite: str, findings: Sequence[Finding]) -> str:
     return f'if it is intended: estima check{options} --accept "REASON"'
 
 
-def _where_to_look(suite: str, findings: Sequence[Finding]) -> str:
+def _where_to_look(whole: Suite, findings: Sequence[Finding]) -> str:
     """Worst recordings of each worsened estimator, and the command that draws the worst of them."""
     lines = []
-    whole = read_suite(suite_path(suite))
     for finding in {f.estimator: f for f in reversed(findings) if f.alarms and f.worst}.values():
         unit = COLUMNS[finding.error].unit
         lines += [

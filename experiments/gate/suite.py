@@ -23,10 +23,12 @@ from pydantic import Field, Strict
 
 from estimators.base import Estimate, Estimator
 from experiments.runs import paths
+from experiments.runs.compose import searched
 from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Outcome
 from experiments.runs.seeds import stream
+from experiments.sweeps.commands import config_dir_option
 from experiments.viewing.run_figure import run_figure
 from experiments.viewing.style import save_figure
 from sim.errors import InputError, printable, require
@@ -116,6 +118,8 @@ class Suite:
         In the order of the file.
     source
         The file; None of the package's own.
+    config_dir
+        A further folder of options, which the user names.
     """
 
     first_seed: int
@@ -123,12 +127,14 @@ class Suite:
     overrides: Mapping[str, tuple[str, ...]]
     estimators: tuple[Entry, ...]
     source: Path | None = None
+    config_dir: Path | None = None
 
     def compose(self, overrides: Sequence[str]) -> Experiment:
         """Compose the experiment of overrides that it holds."""
+        words = searched(self.config_dir)
         if self.source is None:
-            return Experiment.compose(overrides)
-        return Experiment.compose(data=overrides, source=self.source)
+            return Experiment.compose([*words, *overrides])
+        return Experiment.compose(words, data=overrides, source=self.source)
 
     def cut(self, share: float) -> Suite:
         """Return the same suite with this share of its recordings."""
@@ -162,7 +168,7 @@ class Suite:
 Planted = Callable[[Estimator, np.random.Generator], AbstractContextManager[object]]
 
 
-def read_suite(path: Path) -> Suite:
+def read_suite(path: Path, config_dir: Path | None = None) -> Suite:
     """Read a suite.
 
     Raises
@@ -176,7 +182,7 @@ def read_suite(path: Path) -> Suite:
     except InputError as error:
         raise InputError(f"{path}: {error}; conf/suite/check.yaml is an example") from error
     own = path.resolve().is_relative_to(paths.CONF.resolve())
-    return dataclasses.replace(suite, source=None if own else path)
+    return dataclasses.replace(suite, source=None if own else path, config_dir=config_dir)
 
 
 def _suite(file: _File) -> Suite:
@@ -241,7 +247,7 @@ def run_suite(
         runs = [
             (
                 entry,
-                suite.compose(_overrides(suite, entry)).with_values(repeats=repeats[entry.name]),
+                suite.compose(overrides_of(suite, entry)).with_values(repeats=repeats[entry.name]),
                 (planted or {}).get(entry.name),
             )
             for entry in suite.estimators
@@ -268,7 +274,7 @@ def draw_run(suite: Suite, estimator: str, recording: int, path: Path) -> bool:
         estimates.append((read, revised if entry.revised and revised is not None else online))
 
     (row, *_) = evaluate(
-        suite.compose(_overrides(suite, entry, recording)).with_values(repeats=1),
+        suite.compose(overrides_of(suite, entry, recording)).with_values(repeats=1),
         streams=partial(_stream, f"estimator/{estimator}", recording, 0),
         on_estimate=keep,
     )
@@ -280,10 +286,17 @@ def draw_run(suite: Suite, estimator: str, recording: int, path: Path) -> bool:
 def command_of(suite: Suite, estimator: str, recording: int) -> str:
     """Return the command that runs one estimator over one recording of a suite, and draws it."""
     (entry,) = suite.select([estimator]).estimators
-    return shlex.join(["estima", "run", *_overrides(suite, entry, recording)])
+    return shlex.join(
+        [
+            "estima",
+            "run",
+            *overrides_of(suite, entry, recording),
+            *config_dir_option(suite.config_dir),
+        ]
+    )
 
 
-def _overrides(suite: Suite, entry: Entry, seed: int | None = None) -> list[str]:
+def overrides_of(suite: Suite, entry: Entry, seed: int | None = None) -> list[str]:
     """Overrides of an estimator over its recordings, or over the one of a seed."""
     seeds = [] if seed is None else [f"seed={seed}", f"world_seed={seed}"]
     of_group = suite.overrides[entry.recordings]

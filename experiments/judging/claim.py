@@ -24,6 +24,7 @@ class Verdict(StrEnum):
 
     REPRODUCED = "reproduced"
     NOT_REPRODUCED = "not_reproduced"
+    DEPENDS = "depends"  # holds in a part of the region of the free settings; see `region.rule`
     UNDECIDED = "undecided"  # the interval spans the criterion, or the data are too few
     SHOWN = "shown"  # without a criterion
 

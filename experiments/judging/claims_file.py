@@ -5,7 +5,8 @@ verdict on each claim; results/provenance.json says how they were made.
 """
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from datetime import date
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,8 @@ import numpy as np
 import pandas as pd
 
 from experiments.judging.claim import Claim, Role, Verdict
+from experiments.judging.folders import findings
+from experiments.judging.region import region_columns
 from experiments.judging.results import Profile, reproduce_command
 from experiments.judging.sentences import Conclusion
 from experiments.runs.row import read_rows, write_frame
@@ -20,21 +23,33 @@ from experiments.runs.version import code_version, describe_machine
 from sim.errors import InputError, require
 from sim.files import require_file, write_whole
 
-VERDICT_COLUMNS = ("id", "paper", "says", "verdict", "sentence")
-_NUMBERS = ("value", "low", "high")
+REGION_COLUMNS = (
+    "anchor",
+    "holds_at_anchor",
+    "region_share",
+    "region_low",
+    "region_high",
+    "decided_by",
+    "boundary",
+)
+VERDICT_COLUMNS = ("id", "paper", "says", "verdict", "sentence", *REGION_COLUMNS)
+_FOUND = ("value", "low", "high")
+_NUMBERS = (*_FOUND, "region_share", "region_low", "region_high")
 _ENUMS = {"role": Role, "verdict": Verdict, "profile": Profile}
 COLUMNS = (
     "id",
     "paper",
     "role",
     "statistic",
-    *_NUMBERS,
+    *_FOUND,
     "criterion",
     "verdict",
     "reason",
     "profile",
     "study",
     "command",
+    "criterion_since",
+    "after_data",
 )
 # The pattern of each text, and what it describes
 _TEXTS = {
@@ -42,7 +57,11 @@ _TEXTS = {
     "paper": (r"[a-z][a-z0-9_]*", "a paper's short name"),
     **dict.fromkeys(("statistic", "says", "sentence"), (r"(?s).+", "a text")),
     **{name: ("|".join(kind), f"one of {', '.join(kind)}") for name, kind in _ENUMS.items()},
+    "criterion_since": (r"\d{4}-\d\d-\d\d", "a date such as 2026-11-21"),
+    "after_data": ("yes|no", "yes or no"),
+    "holds_at_anchor": ("|yes|no|unclear", "yes, no, unclear or empty"),
 }
+FIRST_CRITERIA = date(2026, 11, 21)  # before any result was judged
 _ORIGIN = ("profile", "seconds", "code_version")
 _REMEDY = f"restore it by `git checkout`, or delete it and run `{reproduce_command(None)}`"
 
@@ -55,7 +74,11 @@ def write_claims(
     The statistics of a claim stay in the order given.
     """
     origin = {"paper": paper, "profile": profile, "study": paper, "command": command}
-    rows = [{**vars(claim), "id": claim.id, **vars(claim.found), **origin} for claim in claims]
+    since = criteria(paper)
+    rows = [
+        {**vars(claim), "id": claim.id, **vars(claim.found), **origin, **since(claim.id)}
+        for claim in claims
+    ]
     new = pd.DataFrame(rows, columns=list(COLUMNS)).astype(dict.fromkeys(_ENUMS, "str"))
     _replace(new, read_claims(path), path, paper)
 
@@ -85,10 +108,36 @@ def write_verdicts(
             "sentence": each.sentence + mark,
             "paper": paper,
             "says": says[each.id],
+            **region_columns(each.region, each.at_anchor),
         }
         for each in conclusions
     ]
     _replace(pd.DataFrame(rows, columns=list(VERDICT_COLUMNS)), read_verdicts(path), path, paper)
+
+
+def criteria(study: str) -> Callable[[str], dict[str, str]]:
+    """When a claim's criterion last changed, and whether after a look at judged data, by its id.
+
+    Both stand in the study's findings, `criteria`; other claims have the first version's.
+
+    Raises
+    ------
+    InputError
+        If a date or an answer there is none.
+    """
+    given = findings(study).get("criteria", {})
+    for claim, own in given.items():
+        good = isinstance(own, dict) and isinstance(own.get("since"), date)
+        good = good and isinstance(own.get("after_data"), bool)
+        where = f"{study}/findings.yaml: criteria.{claim}"
+        require(good, f"{where}: needs since, a date, and after_data, true or false")
+
+    def since(claim: str) -> dict[str, str]:
+        own = given.get(claim, {"since": FIRST_CRITERIA, "after_data": False})
+        answer = "yes" if own["after_data"] else "no"
+        return {"criterion_since": own["since"].isoformat(), "after_data": answer}
+
+    return since
 
 
 def _replace(new: pd.DataFrame, old: pd.DataFrame, path: Path, paper: str) -> None:
@@ -106,7 +155,7 @@ def read_claims(path: Path) -> pd.DataFrame:
         If the last row is cut off, or a row is a duplicate or has an invalid cell.
     """
     table = _read(path, COLUMNS, ["paper", "id", "statistic"])
-    return table.assign(reason=table["reason"].fillna("")).astype(dict.fromkeys(_NUMBERS, float))
+    return table.assign(reason=table["reason"].fillna("")).astype(dict.fromkeys(_FOUND, float))
 
 
 def read_verdicts(path: Path) -> pd.DataFrame:
@@ -133,7 +182,7 @@ def _read(path: Path, columns: Sequence[str], key: list[str]) -> pd.DataFrame:
     absent = [name for name in columns if name not in table]
     require(not absent, f"{path}: no column {', '.join(absent)}; {_REMEDY}")
     bad = {
-        name: ~table[name].astype("str").str.fullmatch(_TEXTS[name][0], na=False)
+        name: ~table[name].fillna("").astype("str").str.fullmatch(_TEXTS[name][0])
         for name in _TEXTS
         if name in columns
     }

@@ -35,8 +35,9 @@ def findings(study: str) -> dict[str, Any]:
     """A study's findings in our words.
 
     They are its `title`, the paper's `source` and `doi`, `about`, `claims` and `sentences` by id,
-    those claims that are our `own` rather than the paper's, sequential `designs` by id, and
-    `figures` by file name.
+    those claims that are our `own` rather than the paper's, sequential `designs` by id, free
+    settings (`regions`) by id, when criteria changed (`criteria`) by id, and `figures` by file
+    name.
     """
     path = code_folder(study) / "findings.yaml"
     found = read_yaml(path) if path.exists() else {}

@@ -8,6 +8,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from types import MappingProxyType
 from typing import Any
 
 from jinja2 import Environment, StrictUndefined
@@ -22,6 +23,7 @@ from experiments.judging.claim import (
     select,
     select_all,
 )
+from experiments.judging.region import Region, rule
 
 
 @dataclass(frozen=True)
@@ -31,29 +33,41 @@ class Conclusion:
     id: str
     verdict: Verdict
     sentence: str
+    region: Region | None = None
+    at_anchor: Verdict = Verdict.SHOWN  # of the headlines; the claim's own without a region
 
 
-def conclude(claims: Iterable[Claim], findings: Mapping[str, Any]) -> list[Conclusion]:
-    """Give each claim its verdict, which follows from its headlines alone, and its sentence.
+def conclude(
+    claims: Iterable[Claim],
+    findings: Mapping[str, Any],
+    regions: Mapping[str, Region] = MappingProxyType({}),
+) -> list[Conclusion]:
+    """Give each claim its verdict and its sentence.
 
-    Without headlines a claim is shown. If it is undecided, the sentence also says with what power
-    data of that size decide.
+    The verdict follows from the headlines alone, and from the region of free settings if the claim
+    has one; the headlines are then those at its anchor, and the sentence says what decides.
+    Without headlines or region a claim is shown. If it is undecided, the sentence also says with
+    what power data of that size decide.
 
     Parameters
     ----------
     findings
         `sentences`, a template by the claim's id.
+    regions
+        By the claim's id.
     """
     by_id: dict[str, list[Claim]] = {}
     for claim in claims:
         by_id.setdefault(claim.id, []).append(claim)
     conclusions = []
     for key, rows in by_id.items():
-        verdict = headline_verdict([(row.role, row.verdict) for row in rows])
-        said = sentence(findings["sentences"][key], rows)
+        verdict = at_anchor = headline_verdict([(row.role, row.verdict) for row in rows])
+        said, region = sentence(findings["sentences"][key], rows), regions.get(key)
+        if region:
+            verdict, said = rule(at_anchor, region.share), f"{said} {region.words(at_anchor)}"
         if verdict is Verdict.UNDECIDED:
             said += power_stated(rows)
-        conclusions.append(Conclusion(key, verdict, said))
+        conclusions.append(Conclusion(key, verdict, said, region, at_anchor))
     return conclusions
 
 

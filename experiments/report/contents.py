@@ -62,8 +62,8 @@ def contents(results: Path, on_progress: Callable[[float], None]) -> dict[str, A
     made = read_provenance(results)
     papers = [*PAPERS, *sorted(set(table["paper"]) - set(PAPERS))]
     about = {name: findings(name) for name in (*papers, *OWN)}
-    sentences = read_verdicts(results / "verdicts.csv").set_index("id")["sentence"].to_dict()
-    claims = judged_claims(table, about, sentences)
+    verdicts = read_verdicts(results / "verdicts.csv").set_index("id")
+    claims = judged_claims(table, about, verdicts)
     commands = {name: [reproduce_command(name)] for name in papers} | OWN
     commands |= {str(k): list(v.unique()) for k, v in table.groupby("paper")["command"]}
     studies = {}
@@ -115,14 +115,18 @@ def tally(claims: Iterable[Entry]) -> list[tuple[Verdict, int]]:
 
 
 def judged_claims(
-    table: pd.DataFrame, about: Mapping[str, Entry], sentences: Mapping[str, str]
+    table: pd.DataFrame, about: Mapping[str, Entry], verdicts: pd.DataFrame
 ) -> Mapping[str, Entry]:
     """Every claim by its id: those of the papers' findings in their order, then the others.
 
     Each has what the paper `says`, and whether that is our `own`; its `statistics`, the rows of the
-    table, headlines first; its `ruling`, the verdict that follows from the headlines, also in words
-    (`verdict`) with a `style`; and the `sentence` on what came out.
+    table, headlines first; its `ruling`, the verdict that follows from the headlines and from the
+    region of free settings if it has one, also in words (`verdict`) with a `style`; and the
+    `sentence` on what came out.
     """
+    sentences = verdicts["sentence"].to_dict()
+    decided = verdicts.loc[verdicts["region_share"].notna(), "verdict"]
+    by_region = {key: Verdict(text) for key, text in decided.items()}
     says = {key: text for page in about.values() for key, text in page["claims"].items()}
     own = {key for page in about.values() for key in page["own"]}
     rows: dict[str, list[Entry]] = {key: [] for key in says}
@@ -138,15 +142,15 @@ def judged_claims(
             "sentence": sentences.get(key, ""),
             "paper": statistics[0]["paper"] if statistics else "",
             "statistics": statistics,
-            **verdict_on(statistics),
+            **verdict_on(statistics, by_region.get(key)),
         }
         for key, statistics in rows.items()
     }
 
 
-def verdict_on(statistics: Sequence[Entry]) -> Entry:
+def verdict_on(statistics: Sequence[Entry], by_region: Verdict | None = None) -> Entry:
     """The one verdict on a claim, also in words, and its style."""
-    ruling = headline_verdict([(row["role"], row["verdict"]) for row in statistics])
+    ruling = by_region or headline_verdict([(row["role"], row["verdict"]) for row in statistics])
     quick = " (quick)" if any(row["profile"] == Profile.QUICK for row in statistics) else ""
     words, style = ruling.label + quick, ruling.value
     if ruling is Verdict.SHOWN:

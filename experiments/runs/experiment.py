@@ -15,7 +15,7 @@ from omegaconf import OmegaConf
 
 from estimators.base import Estimator
 from estimators.programs.host import Isolated
-from estimators.programs.offline import needs_of
+from estimators.programs.places import needs_of
 from experiments.runs import paths
 from experiments.runs.compose import open_composer
 from experiments.runs.key import origin_columns, run_key

@@ -114,7 +114,7 @@ def check_table(table: pd.DataFrame, path: Path) -> None:
     import pandas as pd
 
     sound = {
-        "run_key": lambda column: column.astype(str).str.fullmatch(_KEY) & column.notna(),
+        "run_key": lambda column: column.map(str).str.fullmatch(_KEY) & column.notna(),
         "status": lambda column: column.isin(_OUTCOMES),
         "choice.estimator": lambda column: column.notna(),
         REPEAT: lambda column: pd.to_numeric(column, errors="coerce").mod(1) == 0,

@@ -225,9 +225,6 @@ def test_believed_by_a_run(tmp_path, log, found):
     believed = experiment.recording()
     assert believed.robot.track_m == pytest.approx(TRACK_M, rel=0.02)
     assert Experiment.compose([given[0]]).recording().robot.track_m == ROBOT.track_m
-    first = experiment.key
-    path.write_text(path.read_text().replace("delay_s: 0.", "delay_s: 0.0", 1))
-    assert Experiment.compose([*given, "estimator=ekf_slam"]).key != first
     with pytest.raises(InputError, match=r"set estimator\.kr"):
         Experiment.compose([*given, "robot.kr=1e-3"])
     with pytest.raises(InputError, match="set recording too"):

@@ -1,10 +1,12 @@
 """Suites, and trajectories that were made elsewhere."""
 
 import dataclasses
+import re
 from functools import partial
 
 import numpy as np
 import pytest
+from hydra.errors import MissingConfigException
 
 from experiments.gate import baseline
 from experiments.gate import compare as regress
@@ -245,3 +247,22 @@ def test_fingerprints_distinguish_recordings_and_ignore_rounding():
     for log, is_same in ((rounded, True), (dataclasses.replace(wheels, position_m=nudged), False)):
         other = fingerprint(Team((dataclasses.replace(recording, wheels=log),)))
         assert (abs(other / sound - 1.0) < regress.ROUNDING) == is_same
+
+
+def test_an_estimator_of_ones_own_folder_is_gated(small, tmp_path, monkeypatch, capsys):
+    """A Python file, its option in --config-dir, and a line in the suite; without --trust."""
+    monkeypatch.delenv("ESTIMA_TRUST", raising=False)
+    (tmp_path / "gated_mine.py").write_text(
+        "from estimators.odometry import Odometry\n\n\nclass Mine(Odometry):\n    pass\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    own = tmp_path / "own"
+    (own / "estimator").mkdir(parents=True)
+    (own / "estimator" / "mine.yaml").write_text("_target_: gated_mine.Mine\nkr: 3e-5\n")
+    small.write_text(small.read_text() + "  mine: { recordings: room, repeats: [1, 1] }\n")
+    with pytest.raises(MissingConfigException, match="mine"):
+        run_check(str(small), "first")
+    run_check(str(small), "first", config_dir=own)
+    assert not run_check(str(small), None, config_dir=own)
+    assert re.search(r"mine +1.000 +1.000 +1.000 identical", capsys.readouterr().out)
+    assert f"--config-dir {own}" in command_of(read_suite(small, own), "mine", 5)

@@ -248,7 +248,8 @@ def test_statistics_of_a_claim_stay_in_the_order_given(tmp_path):
     assert read_claims(path)["statistic"].tolist()[:2] == ["the headline", "a detail"]
 
 
-ROW = "PB1,puzzlebot2024,headline,a statistic,0.5,0.4,0.6,at least 0.4,reproduced,,full,s,c"
+ROW = "PB1,puzzlebot2024,headline,a statistic,0.5,0.4,0.6,at least 0.4,reproduced,,full,s,c,"
+ROW += "2026-11-21,no"
 
 
 @pytest.mark.parametrize(
@@ -265,6 +266,8 @@ ROW = "PB1,puzzlebot2024,headline,a statistic,0.5,0.4,0.6,at least 0.4,reproduce
         (ROW.replace("puzzlebot2024", "") + "\n", "row 2: paper is nan"),
         (ROW.replace("puzzlebot2024", "../evil paper") + "\n", "row 2: paper is '../evil paper'"),
         (ROW.replace("puzzlebot2024", "a.b.c") + "\n", "row 2: paper is 'a.b.c'"),
+        (ROW.replace("2026-11-21", "today") + "\n", "row 2: criterion_since is 'today'"),
+        (ROW.replace(",no", ",perhaps") + "\n", "row 2: after_data is 'perhaps'"),
         (ROW.replace("PB1", "<b>") + "\n", "row 2: id is '<b>'"),
     ],
 )

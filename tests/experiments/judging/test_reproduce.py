@@ -89,7 +89,8 @@ def test_a_run_replaces_everything(results, monkeypatch):
 
 
 def test_each_claim_gets_one_row_and_one_line(results, capsys):
-    (row,) = read_verdicts(results / "verdicts.csv").to_dict("records")
+    found = read_verdicts(results / "verdicts.csv")
+    (row,) = found.dropna(axis="columns").to_dict("records")  # no region: its cells are empty
     assert row == {
         "id": "GI1",
         "paper": PAPER,

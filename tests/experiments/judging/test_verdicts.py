@@ -162,10 +162,12 @@ def test_verdicts_are_written_one_row_a_claim(tmp_path):
 @pytest.mark.parametrize(
     ("row", "wrong"),
     [
-        ("PB1,p,says,undecided,a sentence", "the last row is cut off"),
-        ("PB1,p,says,perhaps,a sentence\n", "row 2: verdict is 'perhaps'"),
-        ("PB1,p,says,undecided,\n", "row 2: sentence is nan"),
-        ("PB1,p,s,shown,a\nPB1,p,s,shown,b\n", "row 3: a duplicate"),
+        ("PB1,p,says,undecided,a sentence,,,,,,,", "the last row is cut off"),
+        ("PB1,p,says,perhaps,a sentence,,,,,,,\n", "row 2: verdict is 'perhaps'"),
+        ("PB1,p,says,undecided,,,,,,,,\n", "row 2: sentence is nan"),
+        ("PB1,p,says,depends,a,k = 1,maybe,,,,,\n", "row 2: holds_at_anchor is 'maybe'"),
+        ("PB1,p,says,depends,a,k = 1,yes,much,,,,\n", "row 2: region_share is 'much'"),
+        ("PB1,p,s,shown,a,,,,,,,\nPB1,p,s,shown,b,,,,,,,\n", "row 3: a duplicate"),
     ],
 )
 def test_damaged_verdicts_are_refused_in_one_line(tmp_path, row, wrong):

@@ -16,6 +16,7 @@ from experiments.judging.claim import Claim, Subject, Verdict, beside
 from experiments.judging.claims_file import (
     note_provenance,
     read_claims,
+    read_verdicts,
     write_claims,
     write_verdicts,
 )
@@ -277,7 +278,7 @@ def test_a_damaged_figure_is_named(tmp_path, results):
 def test_findings_are_complete(paper):
     about = contents.findings(paper)
     kept = {"title", "source", "doi", "about", "claims", "own", "sentences", "figures"}
-    assert set(about) - {"designs"} == kept
+    assert set(about) - {"designs", "criteria", "regions"} == kept
     assert bool(about["source"]) == (paper in contents.PAPERS)
     assert set(about["own"]) <= set(about["claims"])
     for name, figure in about["figures"].items():
@@ -429,12 +430,14 @@ def test_a_tuned_method_is_no_second_one_and_ties_are_said(tmp_path):
     assert not any(row["level"] for row in leaderboard.on_lasers(path)["rows"])
 
 
-def test_what_a_paper_does_not_claim_is_not_counted_as_its_claim():
+def test_what_a_paper_does_not_claim_is_not_counted_as_its_claim(tmp_path):
     rows = [{"role": "headline", "verdict": v, "profile": "full", "paper": "maximo2024"} for v in
             ("not_reproduced", "reproduced")]  # fmt: skip
     table = pd.DataFrame(rows).assign(id=["MX1", "MX6"])
     about = {"maximo2024": contents.findings("maximo2024")}
-    claims = contents.judged_claims(table, about, {})
+    claims = contents.judged_claims(
+        table, about, read_verdicts(tmp_path / "none.csv").set_index("id")
+    )
     assert [key for key, claim in claims.items() if claim["own"]] == ["MX6", "MX7", "MX8"]
 
 

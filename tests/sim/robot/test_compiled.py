@@ -51,7 +51,7 @@ class Compiles:
 def test_the_times_of_a_run_are_without_compiling():
     recording = circle(n_frames=3)
     begun = time.process_time()
-    online, _ = run_over(recording, Compiles(), tracking_prior(recording), None)
+    online, _ = run_over(recording, Compiles(), tracking_prior(recording), np.random.default_rng(0))
     spent_s = time.process_time() - begun
     assert 0.0 < online.cpu_seconds < 0.5 * spent_s
     assert 0.0 < online.step_seconds.sum() < 0.5 * spent_s

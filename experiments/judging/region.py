@@ -1,0 +1,294 @@
+"""Where in the region of its free settings a claim holds, what decides it, and the verdict.
+
+At each of many points of the region the claim's log ratios are known in some worlds. A smooth
+surface through their means predicts them everywhere, and is bootstrapped over worlds.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from experiments.evaluation.statistics import Interval
+from experiments.judging.claim import SMALLEST_EFFECT, Verdict
+from experiments.judging.free_settings import (
+    Anchor,
+    Setting,
+    are_choices,
+    sample,
+    snap,
+    units_of,
+)
+from experiments.judging.surface import Surface, fit_surface
+from sim.arrays import Array
+from sim.errors import require
+
+MOST, LEAST = 0.8, 0.2  # of the region: a claim holds in it, or fails in it
+NOWHERE, EVERYWHERE, NONE_ALONE = (
+    "nowhere in the region",
+    "everywhere in the region",
+    "no single setting",
+)
+_N_SHARE, _N_OTHERS, _N_LEVELS, _N_LINE = 1024, 64, 16, 201
+
+
+@dataclass(frozen=True)
+class Side:
+    """The claim's side of a log ratio: between two limits, one of which may be infinite.
+
+    Attributes
+    ----------
+    effect
+        Smallest effect of interest, a ratio less one: how far beyond a single limit the ratio must
+        lie. A band with two ends is a margin already.
+    """
+
+    low: float = -math.inf
+    high: float = math.inf
+    effect: float = SMALLEST_EFFECT
+
+    def margin(self, logs: Array) -> Array:
+        """How far log ratios lie on the claim's side, by the smallest effect or more if > 0."""
+        is_band = math.isfinite(self.low) and math.isfinite(self.high)
+        need = 0.0 if is_band else math.log1p(self.effect)
+        return np.asarray(np.minimum(logs - self.low, self.high - logs) - need)
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """Surfaces of a claim's headlines, and its data resampled.
+
+    Attributes
+    ----------
+    means
+        For each headline, means (1 + B, P) at the points: first those found, then the resampled.
+    """
+
+    settings: tuple[Setting, ...]
+    sides: tuple[Side, ...]
+    surfaces: tuple[Surface, ...]
+    means: tuple[Array, ...]
+
+    def margins(self, units: Array) -> Array:
+        """Margin (1 + B, N) of the worst headline at places (N, D)."""
+        parts = [
+            side.margin(means @ surface.weights(units).T)
+            for side, surface, means in zip(self.sides, self.surfaces, self.means, strict=True)
+        ]
+        return np.asarray(np.minimum.reduce(parts))
+
+
+@dataclass(frozen=True)
+class Region:
+    """What the region says of a claim.
+
+    Attributes
+    ----------
+    anchor
+        None: nothing but the region is judged.
+    share
+        Of the region, in which the claim holds by the smallest effect of interest.
+    decided_by, boundary
+        The setting that decides, and where the claim begins or ceases to hold along it, in words.
+    """
+
+    anchor: Anchor | None
+    share: Interval
+    decided_by: str
+    boundary: str
+
+    def words(self, at_anchor: Verdict) -> str:
+        """Say in how much of the region the claim holds, what decides, and where the paper lies."""
+        ends = [f"{100.0 * v:.0f}" for v in (self.share.value, self.share.low, self.share.high)]
+        said = f"It holds in {ends[0]} % [{ends[1]}, {ends[2]}] of the region of free settings"
+        if self.boundary in (NOWHERE, EVERYWHERE):
+            pass
+        elif self.decided_by == NONE_ALONE:
+            said += ", and no single setting decides"
+        else:
+            said += f"; {self.decided_by} decides: {self.boundary}"
+        if self.anchor is None:
+            return f"{said}."
+        printed = "where the printed level comes out"
+        if not math.isfinite(self.anchor.level):
+            printed = "the middle of the ranges, as no level is printed"
+        lies = {Verdict.REPRODUCED: "it holds", Verdict.NOT_REPRODUCED: "it does not hold"}
+        there = lies.get(at_anchor, "it is undecided")
+        return f"{said}. At the anchor ({self.anchor.words}), {printed}, {there}."
+
+
+def fit(
+    settings: Sequence[Setting],
+    points: pd.DataFrame,
+    headlines: Sequence[tuple[Array, Side]],
+    rng: np.random.Generator,
+    *,
+    shares_worlds: bool = False,
+    n_resamples: int = 400,
+) -> Fitted:
+    """Fit a surface to the log ratios of each headline, and resample them by worlds.
+
+    Parameters
+    ----------
+    points
+        Settings (P) by name.
+    headlines
+        Log ratios (P, W) at each point in W worlds, and the claim's side.
+    shares_worlds
+        Whether a column is one world at all points; else each point has its own.
+    """
+    units = units_of(settings, points)
+    n_points, n_worlds = headlines[0][0].shape
+    require(n_worlds >= 2, "a region needs two worlds or more at each point")
+    shape = (n_resamples, 1 if shares_worlds else n_points, n_worlds)
+    drawn = rng.integers(n_worlds, size=shape)
+    surfaces, means = [], []
+    for logs, _ in headlines:
+        require(logs.shape == (n_points, n_worlds), "headlines need the same points and worlds")
+        require(bool(np.isfinite(logs).all()), "log ratios of a region must be finite")
+        found = logs.mean(axis=1)
+        away = (logs - found[:, None]) * math.sqrt(n_worlds / (n_worlds - 1.0))  # unbiased variance
+        picked = np.take_along_axis(
+            away[None], np.broadcast_to(drawn, (n_resamples, *logs.shape)), 2
+        )
+        surfaces.append(fit_surface(units, found, are_choices(settings)))
+        means.append(np.vstack([found, found + picked.mean(axis=2)]))
+    sides = tuple(side for _, side in headlines)
+    return Fitted(tuple(settings), sides, tuple(surfaces), tuple(means))
+
+
+def share(fitted: Fitted) -> Interval:
+    """Share of the region in which the claim holds by the smallest effect of interest."""
+    units = units_of(fitted.settings, sample(fitted.settings, _N_SHARE, rng=None))
+    return _interval((fitted.margins(units) > 0.0).mean(axis=1))
+
+
+def first_order(fitted: Fitted) -> Array:
+    """First-order Sobol indices (1 + B, D) of the margin."""
+    d = len(fitted.settings)
+    others = units_of(fitted.settings, sample(fitted.settings, _N_OTHERS, rng=None))
+    found = []
+    for i in range(d):
+        places = np.tile(others, (_N_LEVELS, 1, 1))
+        places[..., i] = ((np.arange(_N_LEVELS) + 0.5) / _N_LEVELS)[:, None]
+        margins = fitted.margins(snap(fitted.settings, places.reshape(-1, d)))
+        by_level = margins.reshape(len(margins), _N_LEVELS, _N_OTHERS)
+        total = np.maximum(by_level.var(axis=(1, 2)), 1e-300)
+        found.append(by_level.mean(axis=2).var(axis=1) / total)
+    return np.stack(found, axis=1)
+
+
+def deciding(indices: Array) -> int | None:
+    """The setting whose index is clear of all others', by the resampled ones; None: none is."""
+    first = int(indices[0].argmax())
+    ahead = indices[:, first] - np.delete(indices, first, axis=1).max(axis=1, initial=0.0)
+    return first if np.quantile(ahead[1:], 0.025) > 0.0 else None
+
+
+def holding(fitted: Fitted, i: int) -> tuple[Interval, Interval] | None:
+    """The longest stretch of setting `i` in which the claim holds, the others at their middle.
+
+    Its two ends, as shares of the range; 0 and 1 without spread where it reaches the range's end.
+    None if the claim holds nowhere on the line.
+    """
+    line = np.full((_N_LINE, len(fitted.settings)), 0.5)
+    line[:, i] = np.linspace(0.0, 1.0, _N_LINE)
+    margins = fitted.margins(snap(fitted.settings, line))
+    stretches = [_longest(row > 0.0) for row in margins]
+    if stretches[0] is None:
+        return None
+    lost = (_N_LINE - 1, 0)  # where nothing is left, each end has met the other end of the range
+    ends = np.array([each or lost for each in stretches]) / (_N_LINE - 1.0)
+    low, high = _interval(ends[:, 0]), _interval(ends[:, 1])
+    return (
+        Interval.exact(0.0) if low.value == 0.0 else low,
+        Interval.exact(1.0) if high.value == 1.0 else high,
+    )
+
+
+def boundary_in_words(fitted: Fitted, i: int) -> str:
+    """Where along setting `i` the claim holds, the others at their middle."""
+    setting, stretch = fitted.settings[i], holding(fitted, i)
+    if setting.choices:
+        line = np.full((len(setting.choices), len(fitted.settings)), 0.5)
+        line[:, i] = setting.units(setting.choices)
+        good = fitted.margins(snap(fitted.settings, line))[0] > 0.0
+        named = [str(c) for c, is_good in zip(setting.choices, good, strict=True) if is_good]
+        return f"holds at {', '.join(named)}" if named else NOWHERE
+    if stretch is None:
+        return NOWHERE
+    low, high = stretch
+
+    def words(end: Interval) -> str:
+        value, least, most = (f"{v:.3g}" for v in setting.at([end.value, end.low, end.high]))
+        return f"{value} [{least}, {most}]"
+
+    parts = [f"above {words(low)}"] * (low.value > 0.0) + [f"below {words(high)}"] * (
+        high.value < 1.0
+    )
+    return f"holds {' and '.join(parts)}" if parts else EVERYWHERE
+
+
+def describe(fitted: Fitted, anchor: Anchor | None) -> Region:
+    """What a fitted region says of its claim."""
+    found, first = share(fitted), deciding(first_order(fitted))
+    if found.value in (0.0, 1.0):
+        at = NOWHERE if found.value == 0.0 else EVERYWHERE
+        return Region(anchor, found, NONE_ALONE, at)
+    if first is None:
+        return Region(anchor, found, NONE_ALONE, "")
+    return Region(anchor, found, fitted.settings[first].name, boundary_in_words(fitted, first))
+
+
+def rule(at_anchor: Verdict, found: Interval) -> Verdict:
+    """The verdict on a claim by its headlines at the anchor and the region's share.
+
+    Parameters
+    ----------
+    at_anchor
+        Of the headlines together; `SHOWN` for a claim that is judged by its region alone.
+    found
+        Share of the region in which the claim holds.
+    """
+    spans = any(found.low <= limit <= found.high for limit in (LEAST, MOST))
+    if at_anchor is Verdict.UNDECIDED or spans or not math.isfinite(found.value):
+        return Verdict.UNDECIDED
+    if found.low > MOST and at_anchor is not Verdict.NOT_REPRODUCED:
+        return Verdict.REPRODUCED
+    if found.high < LEAST and at_anchor is not Verdict.REPRODUCED:
+        return Verdict.NOT_REPRODUCED
+    return Verdict.DEPENDS
+
+
+def region_columns(region: Region | None, at_anchor: Verdict) -> Mapping[str, Any]:
+    """The cells of verdicts.csv on the region; empty for a claim without free settings."""
+    if region is None:
+        return {}
+    holds = {Verdict.REPRODUCED: "yes", Verdict.NOT_REPRODUCED: "no"}
+    return {
+        "anchor": region.anchor.words if region.anchor else "",
+        "holds_at_anchor": holds.get(at_anchor, "unclear") if region.anchor else "",
+        "region_share": region.share.value,
+        "region_low": region.share.low,
+        "region_high": region.share.high,
+        "decided_by": region.decided_by,
+        "boundary": region.boundary,
+    }
+
+
+def _interval(values: Array) -> Interval:
+    """The first value, and the interval of the others."""
+    low, high = np.quantile(values[1:], [0.025, 0.975])
+    return Interval(float(values[0]), float(min(low, values[0])), float(max(high, values[0])))
+
+
+def _longest(holds: Array) -> tuple[int, int] | None:
+    """First and last place of the longest stretch that holds; None if there is none."""
+    edges = np.flatnonzero(np.diff(np.r_[0, holds.astype(int), 0]))
+    if not len(edges):
+        return None
+    k = int((edges[1::2] - edges[::2]).argmax())
+    return int(edges[2 * k]), int(edges[2 * k + 1]) - 1
