@@ -112,46 +112,69 @@ def _filter(chain: Chain) -> tuple[Array, Array]:
 
 def _with_landmarks(chain: Chain, sights: Sights, given: PathBound, gains: Array) -> PathBound:
     """The bounds, from those given the landmarks and the gains of smoothing."""
-    n_frames, n = len(chain.noise), 3 * (int(sights.landmarks.max()) + 1)
-    cross = np.zeros((n_frames, 3, n))
-    for row, landmark, block in zip(sights.rows, sights.landmarks, sights.cross, strict=True):
-        cross[row, :, 3 * landmark : 3 * landmark + 3] += block
-    U, V = np.zeros((n_frames, 3, n)), np.zeros((n_frames, 3, n))
-    seeing = np.unique(sights.rows)
-    sees = np.isin(np.arange(n_frames), seeing)
-    for k in range(n_frames):
-        if k:
-            U[k] = chain.by_before[k] @ U[k - 1]
-        V[k] = chain.information[k] @ U[k] + cross[k]
-        if sees[k] or chain.information[k].any():
-            U[k] -= given.online[k] @ V[k]
-    online, revised = given.online.copy(), given.revised.copy()
-    S, begin = np.zeros((n, n)), int(seeing[0])
-    for end in _group_ends(seeing, n_frames):
-        group = slice(begin, end)
-        seen = slice(*np.searchsorted(sights.rows, [begin, end]))
-        known = 3 * (int(sights.landmarks[: seen.stop].max()) + 1)
-        part = S[:known, :known]
-        _add_information(
-            part,
-            chain.information[group],
-            given.online[group],
-            U[group, :, :known],
-            V[group, :, :known],
-        )
+    # Only Frames that measure something are kept (m of them); the others are reached from those.
+    seeing = np.union1d(sights.rows, np.flatnonzero(chain.information.any(axis=(1, 2))))
+    m, n_landmarks = len(seeing), int(sights.landmarks.max()) + 1
+    last = np.searchsorted(seeing, np.arange(len(chain.noise)), side="right")  # 0: none yet
+    into, onward, back = _between(chain.by_before, gains, seeing)
+    own_rows = np.searchsorted(seeing, sights.rows)
+    V, U = np.zeros((m, 3, n_landmarks, 3)), np.zeros((m, 3, 3 * n_landmarks))
+    V[own_rows, :, sights.landmarks] = sights.cross
+    V = V.reshape(U.shape)
+    information, updated = chain.information[seeing], given.online[seeing]
+    for j in range(m):
+        if j:
+            U[j] = into[j] @ U[j - 1]
+        V[j] += information[j] @ U[j]
+        U[j] -= updated[j] @ V[j]
+    S, spread = np.zeros((U.shape[2],) * 2), np.zeros((m + 1, 3, 3))
+    for group in np.array_split(np.arange(m), min(m, _GROUPS)):
+        rows = slice(group[0], group[-1] + 1)
+        seen = slice(*np.searchsorted(own_rows, [rows.start, rows.stop]))
+        known = 3 * (int(sights.landmarks[: seen.stop].max(initial=-1)) + 1)
+        part, of_known = S[:known, :known], U[rows, :, :known]
+        _add_information(part, information[rows], updated[rows], of_known, V[rows, :, :known])
         for landmark, own in zip(sights.landmarks[seen], sights.own[seen], strict=True):
             part[3 * landmark : 3 * landmark + 3, 3 * landmark : 3 * landmark + 3] += own
-        online[group] += _spread(part, U[group, :, :known])
-        begin = end
-    for k in range(n_frames - 2, -1, -1):
-        U[k] += gains[k] @ (U[k + 1] - chain.by_before[k + 1] @ U[k])
-    return PathBound(online, revised + _spread(S, U))
+        half = _solve_root(part, of_known)
+        spread[1:][rows] = half @ half.transpose(0, 2, 1)
+    online = given.online + onward @ spread[last] @ onward.transpose(0, 2, 1)
+    smoothed = U.copy()
+    for j in range(m - 2, -1, -1):
+        smoothed[j] += back[seeing[j]] @ (smoothed[j + 1] - into[j + 1] @ U[j])
+    # A Frame between two that are kept: filtered at the one before, smoothed at the one after
+    none = np.zeros((1, 3, U.shape[2]))
+    ends = np.hstack(
+        [_solve_root(S, np.vstack([none, U])), _solve_root(S, np.vstack([smoothed, none]))]
+    )
+    by_next = np.vstack([into, np.zeros((1, 3, 3))])[last]
+    by_ends = np.concatenate([onward - back @ by_next, back], axis=2)
+    joint = (ends @ ends.transpose(0, 2, 1))[last]
+    return PathBound(online, given.revised + by_ends @ joint @ by_ends.transpose(0, 2, 1))
 
 
-def _group_ends(seeing: Ints, n_frames: int) -> list[int]:
-    """Frames up to which, each excluded, the information about landmarks is read."""
-    parts = np.array_split(seeing, min(len(seeing), _GROUPS))
-    return [*(int(part[0]) for part in parts[1:]), n_frames]
+def _between(by_before: Array, gains: Array, seeing: Ints) -> tuple[Array, Array, Array]:
+    """How Frames hang on those that are kept.
+
+    Returns
+    -------
+    tuple of Array
+        Derivative (m, 3, 3) of each kept pose by the one kept before; that of every pose (T, 3, 3)
+        by the last kept one; and its gain (T, 3, 3) of smoothing from the next kept one.
+    """
+    kept = np.isin(np.arange(len(by_before)), seeing)
+    into, onward, back = [], np.empty_like(by_before), gains.copy()
+    reached = np.eye(3)
+    for k, F in enumerate(by_before):
+        reached = F @ reached if k else reached
+        if kept[k]:
+            into.append(reached)
+            reached = np.eye(3)
+        onward[k] = reached
+    for k in range(len(gains) - 2, -1, -1):
+        if not kept[k + 1]:
+            back[k] = gains[k] @ back[k + 1]
+    return np.array(into), onward, back
 
 
 def _add_information(S: Array, information: Array, updated: Array, U: Array, V: Array) -> None:
@@ -166,10 +189,9 @@ def _add_information(S: Array, information: Array, updated: Array, U: Array, V: 
     S += (whole + whole.T) / 2.0
 
 
-def _spread(S: Array, U: Array) -> Array:
-    """U S^-1 U^T (T, 3, 3) of U (T, 3, n)."""
+def _solve_root(S: Array, U: Array) -> Array:
+    """U L^-T (m, 3, n) of U (m, 3, n), where S = L L^T."""
     root = scipy.linalg.cholesky(S, lower=True, check_finite=False)
     flat = np.ascontiguousarray(U.reshape(-1, len(S))).T
     half = scipy.linalg.solve_triangular(root, flat, lower=True, check_finite=False)
-    rows = half.T.reshape(U.shape)
-    return np.asarray(rows @ rows.transpose(0, 2, 1))
+    return np.asarray(half.T.reshape(U.shape))
