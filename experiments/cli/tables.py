@@ -61,6 +61,10 @@ def table(
         ),
     ] = None,
     times: Annotated[bool, typer.Option("--times", help="Keep computing times.")] = False,
+    efficiency: Annotated[
+        bool,
+        typer.Option("--efficiency", help="Errors over the least of any method (docs/bound.md)."),
+    ] = False,
     every: Annotated[
         bool, typer.Option("--rows", help="With -o: write every row, with all its columns.")
     ] = False,
@@ -100,7 +104,8 @@ def table(
     if every and out is not None:
         show(of_sweep.write_rows(rows, out))
     else:
-        show(of_sweep.table_of(rows, name, out, against, metric or [], size))
+        named = metric or []
+        show(of_sweep.table_of(rows, name, out, against, named, size, efficiency=efficiency))
 
 
 @dataclass(frozen=True)

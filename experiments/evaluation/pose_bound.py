@@ -94,6 +94,51 @@ def bound_path(chain: Chain) -> PathBound:
     return PathBound(online, revised)
 
 
+def bound_dead_reckoning(
+    start: Array, steps: Array, by_wheels: Array, wheel_covariances: Array
+) -> Array:
+    """Least mean squares of poses by wheels alone, exactly: those of the conditional mean.
+
+    Headings are a random walk, so the moments of positions as complex numbers have a closed form,
+    and no error of a heading is too great for it. Heading errors are wrapped.
+
+    Parameters
+    ----------
+    start
+        (3, 3) covariance of the first pose; position and heading uncorrelated.
+    steps
+        (T, 3) motions that the encoders show; the first is not read.
+    by_wheels
+        (T, 3, 2) their derivatives by the wheels' travel.
+    wheel_covariances
+        (T, 2, 2) of the slip.
+
+    Returns
+    -------
+    Array
+        (T, 3, 3), diagonal; x and y share the error of the position.
+    """
+    heading = start[2, 2] + np.zeros(len(steps))
+    square, mean, to_robot = start[0, 0] + start[1, 1], 0j, 0j  # E|p|^2, E p, E p exp(-i heading)
+    turned = complex(np.exp(-heading[0] / 2.0))  # E exp(i heading)
+    position = np.full(len(steps), square)
+    for k in range(1, len(steps)):
+        (x, y, turn), W = steps[k], wheel_covariances[k]
+        by_way, by_turn = by_wheels[k, 0] + 1j * by_wheels[k, 1], by_wheels[k, 2]
+        spread = by_turn @ W @ by_turn
+        way, turning = complex(x, y), np.exp(-1j * turn - spread / 2.0)
+        square += 2.0 * (to_robot * way.conjugate()).real + abs(way) ** 2
+        square += (by_way @ W @ by_way.conj()).real
+        to_robot = (to_robot + way - 1j * (by_way @ W @ by_turn)) * turning
+        mean, turned = mean + turned * way, turned * turning.conjugate()
+        position[k], heading[k] = square - abs(mean) ** 2, heading[k - 1] + spread
+    n = np.arange(1, 40)[:, None]  # the Fourier series of the wrapped square
+    wrapped = np.pi**2 / 3.0 + 4.0 * ((-1.0) ** n / n**2 * np.exp(-(n**2) * heading / 2.0)).sum(0)
+    small = heading < 0.1
+    diagonal = np.column_stack([position / 2.0, position / 2.0, np.where(small, heading, wrapped)])
+    return np.asarray(diagonal[:, :, None] * np.eye(3))
+
+
 def _filter(chain: Chain) -> tuple[Array, Array]:
     """Covariances (T, 3, 3) of each pose before its measurements and after, landmarks given."""
     predicted, updated = np.empty_like(chain.noise), np.empty_like(chain.noise)

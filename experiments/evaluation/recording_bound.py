@@ -18,7 +18,13 @@ from typing import Any
 import numpy as np
 
 from estimators.base import Prior
-from experiments.evaluation.pose_bound import Chain, PathBound, Sights, bound_path
+from experiments.evaluation.pose_bound import (
+    Chain,
+    PathBound,
+    Sights,
+    bound_dead_reckoning,
+    bound_path,
+)
 from experiments.evaluation.sensor_information import (
     WheelNoise,
     laser_information,
@@ -27,6 +33,7 @@ from experiments.evaluation.sensor_information import (
 )
 from sim.arrays import Array, Ints
 from sim.recording import Recording
+from sim.robot.arc import arc_increment, arc_increment_jacobian
 from sim.robot.base import robot_from_config
 from sim.robot.drive import DifferentialDrive
 from sim.sensors import Encoder, Laser, Sensor, StereoCamera
@@ -48,7 +55,7 @@ def bound_recording(recording: Recording, prior: Prior, names: Iterable[str]) ->
     """Bound at each Frame of a recording; it is made once for several runs.
 
     None where there is no bound: over a recording that was not simulated, without a start, of a
-    robot or a sensor of another law, with a laser but without a map, and without sensors at all.
+    robot or a sensor of another law, and with a laser but without a map.
 
     Parameters
     ----------
@@ -82,7 +89,7 @@ def _is_known(recording: Recording, sensors: list[Sensor | None]) -> bool:
     # a file does not choose what code runs
     if not isinstance(made_with, dict) or made_with.get("_target_", ours) != ours:
         return False
-    return bool(sensors) and all(
+    return all(
         (isinstance(sensor, Laser) and sensor.sigma_range_m > 0.0)
         or (
             isinstance(sensor, StereoCamera)
@@ -95,12 +102,17 @@ def _is_known(recording: Recording, sensors: list[Sensor | None]) -> bool:
 @functools.lru_cache(maxsize=4)
 def _bound(known: _Known) -> PathBound:
     """The bound over all Frames of a recording."""
-    recording, truth = known.recording, known.recording.known_truth
+    recording, start = known.recording, np.frombuffer(known.start).reshape(3, 3)
+    travel_m, wheels = _travel_and_slip(recording)
+    if not known.sensors:
+        steps, by_wheels = (
+            arc_increment(travel_m, wheels.track_m),
+            arc_increment_jacobian(travel_m, wheels.track_m),
+        )
+        alone = bound_dead_reckoning(start, steps, by_wheels, wheels.covariances(travel_m))
+        return PathBound(alone, alone)
     poses = recording.truth_at(recording.frame_stamps)
-    rolled = [np.interp(recording.frame_stamps, truth.stamps, w) for w in truth.wheel_travel_m.T]
-    travel_m = np.diff(rolled, axis=1, prepend=np.array(rolled)[:, :1]).T
-    by_before, noise = motion_terms(poses, travel_m, _wheels(recording))
-    start = np.frombuffer(known.start).reshape(3, 3)
+    by_before, noise = motion_terms(poses, travel_m, wheels)
     chain = Chain(start, by_before, noise, np.zeros_like(noise))
     for name in known.sensors:
         sensor, log = recording.sensors[name], recording.logs[name]
@@ -109,7 +121,7 @@ def _bound(known: _Known) -> PathBound:
             told = laser_information(recording.known_world, sensor, poses[rows], log["ranges_m"])
             np.add.at(chain.information, rows, told)
         elif isinstance(sensor, StereoCamera):
-            seen = np.asarray(truth.readings[name]["true_ids"], np.int64)
+            seen = np.asarray(recording.known_truth.readings[name]["true_ids"], np.int64)
             frames = np.repeat(rows, np.diff(log.known_splits))
             points = recording.known_world.landmarks[seen]
             of_pose, cross, own = stereo_information(sensor, poses[frames], points)
@@ -120,13 +132,15 @@ def _bound(known: _Known) -> PathBound:
     return bound_path(chain)
 
 
-def _wheels(recording: Recording) -> WheelNoise:
-    """How the wheels of the robot that made a recording slip."""
+def _travel_and_slip(recording: Recording) -> tuple[Array, WheelNoise]:
+    """Ground travel (T, 2) of the wheels by the encoders, and how far it may be off."""
     robot: Any = robot_from_config(recording.config["robot"])
     gain = 1.0 + robot.slip_bias  # the encoder reads so much more than the wheel rolls
     # shared slip that lasts is not white; without it the bound is lower
     together = 0.0 if robot.forward_slip_length_m else robot.forward_slip_m / float(gain.max()) ** 2
-    return WheelNoise(robot.slip_variance_per_m / gain**2, together, robot.track_m)
+    rolled_m = recording.wheels.at(recording.frame_stamps) / gain
+    slip = WheelNoise(robot.slip_variance_per_m / gain**2, together, robot.track_m)
+    return np.diff(rolled_m, axis=0, prepend=rolled_m[:1]), slip
 
 
 def _by_first_sight(ids: Ints) -> Ints:

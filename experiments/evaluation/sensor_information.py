@@ -37,6 +37,12 @@ class WheelNoise(NamedTuple):
     together_per_m: float
     track_m: float
 
+    def covariances(self, travel_m: Array) -> Array:
+        """Covariances (T, 2, 2) m^2 of the slip over travel (T, 2) m."""
+        way = np.abs(travel_m)
+        own = way[:, :, None] * np.diag(self.variances_per_m)
+        return np.asarray(own + (self.together_per_m * way.mean(axis=1))[:, None, None])
+
 
 def motion_terms(poses: Array, travel_m: Array, wheels: WheelNoise) -> tuple[Array, Array]:
     """Derivative (T, 3, 3) of each pose by the one before, and the covariance of the slip.
@@ -51,14 +57,11 @@ def motion_terms(poses: Array, travel_m: Array, wheels: WheelNoise) -> tuple[Arr
     travel_m
         (T, 2) that each wheel rolled on the ground since the pose before.
     """
-    way = np.abs(travel_m)
-    W = way[:, :, None] * np.diag(wheels.variances_per_m)
-    W = W + (wheels.together_per_m * way.mean(axis=1))[:, None, None]
     step, at = arc_increment(travel_m, wheels.track_m), np.vstack([poses[:1], poses[:-1]])
     F, by_step = se2.compose_jacobians(at, step)
     G = by_step @ arc_increment_jacobian(travel_m, wheels.track_m)
     F[1:, 0, 2], F[1:, 1, 2] = -np.diff(poses[:, 1]), np.diff(poses[:, 0])
-    return F, G @ W @ G.transpose(0, 2, 1)
+    return F, G @ wheels.covariances(travel_m) @ G.transpose(0, 2, 1)
 
 
 def laser_information(world: World, laser: Laser, poses: Array, ranges_m: ArrayLike) -> Array:

@@ -6,7 +6,7 @@ import itertools
 import numpy as np
 import pytest
 
-from experiments.evaluation.pose_bound import Chain, Sights, bound_path
+from experiments.evaluation.pose_bound import Chain, Sights, bound_dead_reckoning, bound_path
 from experiments.evaluation.scan_bound import fisher_information
 from experiments.evaluation.sensor_information import (
     WheelNoise,
@@ -16,7 +16,7 @@ from experiments.evaluation.sensor_information import (
 )
 from sim import se2
 from sim.arrays import Array
-from sim.robot.arc import arc_increment
+from sim.robot.arc import arc_increment, arc_increment_jacobian
 from sim.sensors import Laser, StereoCamera
 from sim.sensors.base import Mount
 from sim.worlds.world import World
@@ -144,6 +144,28 @@ def test_motion_against_samples() -> None:
     np.testing.assert_allclose(Q[1] / scale, sampled / scale, atol=0.06)
     moved = [se2.compose(start + d, arc_increment(travel_m, 0.3)) for d in 1e-6 * np.eye(3)]
     np.testing.assert_allclose(F[1], ((np.array(moved) - end) / 1e-6).T, atol=1e-5)
+
+
+@pytest.mark.parametrize("slip_m", [1e-6, 0.02])
+def test_dead_reckoning_against_samples(slip_m: float) -> None:
+    """With the greater slip, headings are lost on the way."""
+    wheels = WheelNoise(np.array([slip_m, 2.0 * slip_m]), 0.0, 0.4)
+    travel_m = np.tile([0.11, 0.1], (101, 1))
+    travel_m[0] = 0.0
+    steps, G = arc_increment(travel_m, 0.4), arc_increment_jacobian(travel_m, 0.4)
+    start = np.diag([1e-4, 4e-4, 1e-4])
+    least = bound_dead_reckoning(start, steps, G, wheels.covariances(travel_m))
+    rng = np.random.default_rng(2)
+    poses = rng.standard_normal((20000, 3)) * np.sqrt(np.diag(start))
+    spread = np.sqrt(np.diag(wheels.covariances(travel_m)[1]))
+    for _ in range(100):
+        slips = rng.standard_normal((20000, 2)) * spread
+        poses = se2.compose(poses, arc_increment(travel_m[1] + slips, 0.4))
+    position = np.trace(np.cov(poses[:, :2].T))
+    middle = np.arctan2(*np.array([np.sin(poses[:, 2]), np.cos(poses[:, 2])]).sum(axis=1))
+    heading = np.square(se2.wrap(poses[:, 2] - middle)).mean()
+    got = least[-1, 0, 0] + least[-1, 1, 1], least[-1, 2, 2]
+    np.testing.assert_allclose(got, (position, heading), rtol=0.04)
 
 
 @pytest.mark.parametrize("yaw", [0.0, 0.9])
