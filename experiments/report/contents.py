@@ -35,7 +35,7 @@ OWN = {
         "estima run -m study=leaderboard",
         "estima plot leaderboard --x choice.estimator --by choice.world "
         "-o results/figures/leaderboard_errors.png",
-        "estima table leaderboard --against smoother --times "
+        "estima table leaderboard --against smoother --times --efficiency "
         "-o results/tables/leaderboard_means.csv",
     ],
     "peers": [

@@ -120,6 +120,7 @@ def _of(prefix: str, label: str, symbol: str) -> dict[str, Column]:
 
 REVISED, ANSWER = "revised_", "answer_"
 RELATIVE = "ate_rmse_over_"  # and an estimator: of position errors, on the same recordings
+_BOUNDS = {"ate_rmse_m": "bound_rmse_m", "heading_rmse_rad": "bound_heading_rad"}
 PATH = "answer"  # which path the answer is: online or revised
 # The answer of a method is its revised path if it has one, else the online one. Its columns are not
 # in the files: tables and plots derive them (`sweeps.collect`).
@@ -135,6 +136,12 @@ REPEAT = "repeat"  # counts the runs of an estimator over one recording
 ORIGIN = ("run_key", "code_version", "recording_checksum")
 DEPENDENCIES = "dependencies"  # digest of what a row depends on; see `experiments.runs.store`
 _SETTINGS = ("seed", "world_seed", "repeats", "isolated", "recording", "calibration", "name")
+
+
+def bound_of(name: str) -> str:
+    """Column of the least that an error can be; empty for one without."""
+    own = name.removeprefix(REVISED).removeprefix(ANSWER)
+    return name.removesuffix(own) + _BOUNDS[own] if own in _BOUNDS else ""
 
 
 def is_setting(name: str) -> bool:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import pandas as pd
 
 from experiments.evaluation.statistics import BELOW_BOUND, holm, over_bound
-from experiments.runs.columns import COLUMNS, PATH, RELATIVE
+from experiments.runs.columns import COLUMNS, PATH, RELATIVE, bound_of
 from experiments.runs.console import warn
 from experiments.runs.row import GAP, Outcome
 from experiments.sweeps.averages import (
@@ -38,10 +38,7 @@ _GROUP = "group"  # numbers the rows of a table
 SUFFIXES = ("_low", "_high")  # of the bounds of an interval
 MARKS = ("best", "differs")
 BELOW = "below_bound"  # in what a group's errors are below any honest method's; empty for none
-_BOUNDED = {  # by what is over its bound: the error, and the bound
-    "position": ("answer_ate_rmse_m", "answer_bound_rmse_m"),
-    "heading": ("answer_heading_rmse_rad", "answer_bound_heading_rad"),
-}
+_BOUNDED = {"position": ERROR, "heading": "answer_heading_rmse_rad"}
 
 
 def summary(
@@ -76,8 +73,8 @@ def summary(
     InputError
         If a metric is not in the table, or the estimator is not, or no row has a bound.
     """
-    bounded = [name for pair in _BOUNDED.values() for name in pair] if efficiency else []
-    table = with_answers(table, [*(metrics or _MAIN), *bounded])
+    bounded = [name for error in _BOUNDED.values() for name in (error, bound_of(error))]
+    table = with_answers(table, [*(metrics or _MAIN), *(bounded if efficiency else [])])
     by = distinguishing_settings(table.drop(columns=list(DRAWN), errors="ignore"))
     shown = list(metrics) or [c for c in _MAIN if c in table and table[c].notna().any()]
     for column in shown:
@@ -129,11 +126,12 @@ def _add(found: pd.DataFrame, name: str, means: pd.DataFrame) -> None:
 def _add_efficiency(found: pd.DataFrame, table: pd.DataFrame) -> None:
     """Add the errors over their bounds, pooled over recordings, and which lie below."""
     require(
-        any(bound in table and table[bound].notna().any() for _, bound in _BOUNDED.values()),
+        any(table[b].notna().any() for b in map(bound_of, _BOUNDED.values()) if b in table),
         "no row has a bound: it takes simulated recordings of a known start, and a map for lasers",
     )
     found[BELOW] = ""
-    for kind, (error, bound) in _BOUNDED.items():
+    for kind, error in _BOUNDED.items():
+        bound = bound_of(error)
         known = table.dropna(subset=[error, bound])
         squares = known[[error, bound]].astype(float) ** 2
         means = squares.groupby([known[_GROUP], known[RECORDING]]).mean()
