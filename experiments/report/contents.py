@@ -46,6 +46,7 @@ OWN = {
     "all_estimators": ["estima run -m study=all_estimators"],
     "mcl_office": [reproduce_command("mcl_office")],
     "fastslam_consistency": [reproduce_command("fastslam_consistency")],
+    "self_knowledge": [reproduce_command("self_knowledge")],
 }
 FIRST = (
     "real_logs_building",
