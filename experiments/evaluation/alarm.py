@@ -1,7 +1,7 @@
 """Does a method notice that it is lost? Its alarms against the truth.
 
-It is lost while its position is off by more than `LOST_M`, for `HOLD_S` at least. What it says is its
-extra `lost`, if it gives one, else the standard deviation of its position along the worst
+It is lost while its position is off by more than `LOST_M`, for `HOLD_S` at least. What it says is
+its extra `lost`, if it gives one, else the standard deviation of its position along the worst
 direction; an alarm stands while that is at or above a threshold. A loss is missed if no alarm
 stands within `DELAY_S` of its beginning. False alarms are counted in windows of `WINDOW_S`, each as
 one, that hold neither a loss nor the `DELAY_S` after one.
@@ -81,7 +81,7 @@ def alarm_curve(runs: Sequence[Evidence]) -> Array:
     The thresholds are those at which another loss is missed, and an infinite one, without alarms.
     """
     peaks, quiet = (np.concatenate(parts) for parts in zip(*runs, strict=True))
-    hours = len(quiet) * WINDOW_S / 3600.0
+    hours = np.float64(len(quiet) * WINDOW_S / 3600.0)
     thresholds = np.append(np.unique(peaks[np.isfinite(peaks)]), np.inf)
     missed = np.array([(peaks < threshold).sum() for threshold in thresholds])
     alarms = np.array([(quiet >= threshold).sum() for threshold in thresholds])

@@ -293,7 +293,8 @@ def find_below_bound(new: Make, drives: Sequence[tuple[Recording, Prior]]) -> st
     Sensors that it does not need, and the map, are taken away. Nothing is said where there is no
     bound, as for a laser without a map.
     """
-    needs, squares = getattr(new(), "needs", frozenset()), []
+    needs: frozenset[str] = getattr(new(), "needs", frozenset())
+    squares: list[Array] = []
     named = {getattr(new(), option, option) for need in needs for option in need.split("|")}
     for given, prior in drives:
         recording = given
@@ -313,7 +314,7 @@ def find_below_bound(new: Make, drives: Sequence[tuple[Recording, Prior]]) -> st
         off = se2.difference(means, recording.truth_at(recording.frame_stamps))
         spread = np.diagonal(least.revised, axis1=1, axis2=2)
         squares.append(np.vstack([off**2, spread]).reshape(2, -1, 3).mean(axis=1))
-    errors, bounds = np.moveaxis(squares, 1, 0)
+    errors, bounds = np.array(squares).transpose(1, 0, 2)
     for kind, part in (("position", slice(0, 2)), ("heading", slice(2, 3))):
         ratio, p = over_bound(errors[:, part].sum(axis=1), bounds[:, part].sum(axis=1))
         if p < BELOW_BOUND:

@@ -96,6 +96,18 @@ _OF_THE_PATH = {
     "nees_mean": Column(
         "mean NEES (3 when consistent)", "NEES", better=None, average=Average.PLAIN
     ),
+    **{
+        f"inside_{percent}_share": Column(
+            f"share of poses inside the {percent} % ellipsoid",
+            f"inside {percent} %",
+            "",
+            "linear",
+            None,
+            Average.PLAIN,
+        )
+        for percent in (50, 90, 95)
+    },
+    "sharpness_m": Column("position RMSE by the own covariance", "own RMSE", "m", better=None),
     "rpe_1m_rmse_m": Column("position RMSE over 1 m", "RPE 1 m", "m"),
     "rpe_1m_heading_rmse_rad": Column("heading RMSE over 1 m", "RPE heading 1 m", "rad"),
     "rpe_10m_rmse_m": Column("position RMSE over 10 m", "RPE 10 m", "m"),

@@ -23,4 +23,4 @@ def draw_alarms(table: pd.DataFrame) -> Figure:
     axes.axvline(1.0, color="#999999", lw=0.8, ls=":")
     axes.set_xscale("symlog", linthresh=1.0)
     axes.set(xlabel="false alarms an hour", ylabel="share of losses missed", ylim=(-0.02, 1.02))
-    return with_legend(page)
+    return with_legend(page, ncols=2)

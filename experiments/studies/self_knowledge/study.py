@@ -74,7 +74,7 @@ def said(runs: Sequence[Experiment], planted: Sequence[str] = PLANTED) -> Tables
             driven = lift_wheels(recording) if what == "wheels" else recording
             rng = stream(one.seed, f"estimator/{one.estimator_name}/{what}")
             online, _ = run_over(driven, one.estimator(), prior, rng, ("lost",))
-            labels = {"method": one.estimator_name, "planted": what, "seed": one.seed}
+            labels: Row = {"method": one.estimator_name, "planted": what, "seed": one.seed}
             kinds = evidence_of(truth, online)._asdict()
             rows += [
                 {**labels, "kind": kind, "number": number, "signal": float(value)}
