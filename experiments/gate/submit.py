@@ -13,7 +13,6 @@ import subprocess
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -34,7 +33,6 @@ from experiments.sweeps.averages import RECORDING, averages
 from sim.errors import InputError, naming, printable, require
 from sim.files import write_text
 from sim.options import build, find, options
-from sim.team import Team
 from sim.yaml_file import read_yaml
 
 BOARD = "board"  # column of the class of world
@@ -236,16 +234,11 @@ def _rows(settings: dict[str, Any], submission: Submission, seeds: range) -> pd.
             own = _experiment(settings, submission, board)
             baseline = Experiment.compose([f"study=board/{board}", "estimator=odometry"])
             for seed in seeds:
-                drive = own.with_values(seed=seed, world_seed=seed)
-                read = drive.recordings()
-                for one in (drive, baseline.with_values(seed=seed, world_seed=seed)):
-                    rows += [{BOARD: board, **row} for row in evaluate(one, partial(_same, read))]
+                for one in (own, baseline):
+                    drive = one.with_values(seed=seed, world_seed=seed)
+                    rows += [{BOARD: board, **row} for row in evaluate(drive)]
                 on_progress(len(rows) / 2)
     return pd.DataFrame(rows)
-
-
-def _same(team: Team) -> Team:
-    return team
 
 
 def _digest(folder: Path) -> dict[str, str]:
