@@ -121,10 +121,10 @@ def find_winner(table: pd.DataFrame) -> Winner | None:
 
 def _differing(errors: pd.DataFrame) -> set[frozenset[str]]:
     """Pairs of arms that differ; all are tested, since the best is chosen by the same data."""
-    pairs = [frozenset(map(str, pair)) for pair in combinations(errors, 2)]
-    p = [difference_p(*(errors[name] for name in pair), ERROR) for pair in pairs]
+    pairs = list(combinations(errors, 2))
+    p = [difference_p(errors[first], errors[second], ERROR) for first, second in pairs]
     rejected = holm([1.0 if math.isnan(each) else each for each in p], _LEVEL)
-    return {pair for pair, is_rejected in zip(pairs, rejected, strict=True) if is_rejected}
+    return {frozenset(pair) for pair, is_one in zip(pairs, rejected, strict=True) if is_one}
 
 
 def _rival(name: str, logs: pd.Series[float], differs: bool) -> Rival:
@@ -132,7 +132,7 @@ def _rival(name: str, logs: pd.Series[float], differs: bool) -> Rival:
     half = math.nan
     if n >= MIN_RECORDINGS:
         half = float(stats.t.ppf(0.975, n - 1) * logs.std() / math.sqrt(n))
-    return Rival(name, *(math.exp(mean + side) for side in (0.0, -half, half)), differs)
+    return Rival(name, math.exp(mean), math.exp(mean - half), math.exp(mean + half), differs)
 
 
 def _names(table: pd.DataFrame, arms: list[str]) -> pd.Series[str]:
