@@ -63,7 +63,9 @@ def table(
     times: Annotated[bool, typer.Option("--times", help="Keep computing times.")] = False,
     efficiency: Annotated[
         bool,
-        typer.Option("--efficiency", help="Errors over the least of any method (docs/bound.md)."),
+        typer.Option(
+            "--efficiency", help="Errors over the least of any method (docs/do/bound.md)."
+        ),
     ] = False,
     every: Annotated[
         bool, typer.Option("--rows", help="With -o: write every row, with all its columns.")
