@@ -321,6 +321,7 @@ class Mcl(MclOptions):
         """
         fit = math.exp(float(np.max(of_scan)) / n_beams)
         self._extras["fit"] = fit
+        self._extras["lost"] = 1.0 - fit * self._extras["hypothesis_weight"]
         if self.recovery != "average" or self.alpha_slow == 0.0:
             return 0.0
         self._slow += self.alpha_slow * (fit - self._slow)
@@ -415,6 +416,7 @@ class Mcl(MclOptions):
             "log_weights": self._log_weights,
             "ess": effective_sample_size(self._log_weights),
             "hypothesis_weight": held,
+            "lost": self._extras.get("lost", float(self._everywhere)),
             "injected": 0,
         }
         return Gaussian(mean, (covariance + covariance.T) / 2.0)

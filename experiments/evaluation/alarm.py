@@ -38,15 +38,14 @@ class Evidence(NamedTuple):
 
 def alarm_signal(estimate: Estimate) -> Array:
     """How lost a method says it is (T,): in its own unit, or m; infinite without a pose."""
-    own = estimate.extras.get("lost", [])
+    block, own = estimate.covariances[:, :2, :2], estimate.extras.get("lost", [])
+    known = np.isfinite(estimate.means).all(axis=1) & np.isfinite(block).all(axis=(1, 2))
+    signal = np.full(len(block), np.inf)
     if any(value is not None for value in own):
-        signal = np.array([np.nan if value is None else value for value in own], np.float64)
+        signal[known] = np.array([value or 0.0 for value in own], np.float64)[known]
     else:
-        block = estimate.covariances[:, :2, :2]
-        known = np.isfinite(block).all(axis=(1, 2))
-        signal = np.full(len(block), np.nan)
         signal[known] = np.sqrt(np.maximum(np.linalg.eigvalsh(block[known])[:, -1], 0.0))
-    return np.where(np.isnan(signal), np.inf, signal)
+    return signal
 
 
 def find_losses(stamps: Array, errors_m: Array) -> Array:
