@@ -201,8 +201,9 @@ class Mcl(MclOptions):
     The mean is that of the hypothesis (particles within 1 m and 0.5 rad) of greatest weight; the
     covariance is that of all particles about it, so it shows whether there are others. Extras, of
     the last scan used: `particles` (M, 3), `log_weights` (M,), `ess`, `hypothesis_weight`,
-    `fit`, the likelihood of a beam at the best particle, and `injected`, the number of particles
-    injected, those of rivals that became the belief included; `status` when a scan saw nothing.
+    `fit`, the likelihood of a beam at the best particle, `lost`, 1 less the product of these two,
+    and `injected`, the number of particles injected, those of rivals that became the belief
+    included; `status` when a scan saw nothing.
     """
 
     needs = frozenset({"laser", "map"})
