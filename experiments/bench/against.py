@@ -59,6 +59,13 @@ def git(*words: str, folder: Path | None = None) -> str:
     return ran.stdout.strip()
 
 
+def clone_of(file: Path) -> Path | None:
+    """The clone that a file lies in; None for that of the running code."""
+    if file.resolve().is_relative_to(paths.CONF.resolve()):
+        return None
+    return Path(git("rev-parse", "--show-toplevel", folder=file.resolve().parent))
+
+
 def checkout(revision: str, folder: Path | None = None) -> Checkout:
     """Check a revision out into the cache, as a `git worktree`; take the one that is there.
 
@@ -80,7 +87,7 @@ def checkout(revision: str, folder: Path | None = None) -> Checkout:
 
 
 def run_in(folder: Path, script: str, *arguments: str) -> Any:
-    """What a script prints, as JSON, that imports the code of a folder.
+    """What a script prints, as JSON, that imports the code of a folder before that of now.
 
     Raises
     ------
@@ -88,7 +95,8 @@ def run_in(folder: Path, script: str, *arguments: str) -> Any:
         If it fails.
     """
     threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
-    places = {"PYTHONPATH": str(folder), "ESTIMA_RESULTS": str(paths.results())}
+    found = os.pathsep.join(map(str, (folder, paths.SOURCE)))
+    places = {"PYTHONPATH": found, "ESTIMA_RESULTS": str(paths.results())}
     ran = subprocess.run(
         [sys.executable, "-c", script, *arguments],
         cwd=folder,
