@@ -26,8 +26,7 @@ from sim.errors import InputError, require
 STEP = "step"  # the metric beside ERRORS: a step's time over that at another revision
 NEW = "new recordings"  # the mark where a line begins; the others are verdicts
 _TEXTS = ("commit", "subject", "estimator", "checksum", "status", "against")
-_NUMBERS = ("committed_s", "step_ratio", "step_low", "step_high")
-COLUMNS = ("commit", "committed_s", "subject", *WHICH, "checksum", "fingerprint", *ERRORS,
+COLUMNS = ("commit", "committed_s", "depth", "subject", *WHICH, "checksum", "fingerprint", *ERRORS,
            "status", "against", "step_ratio", "step_low", "step_high")  # fmt: skip
 _MARKED = (Change.WORSE, Change.BETTER, Change.CHANGED, Change.FAILED)
 
@@ -59,7 +58,8 @@ def read_history(path: Path) -> pd.DataFrame:
         )
     twice = rows.duplicated(["commit", *WHICH])
     require(not twice.any(), f"{path}: damaged (two rows of one run)")
-    return rows.sort_values("committed_s", kind="stable", ignore_index=True)
+    order = ["committed_s", "depth"]  # commits of one second are told by their ancestors
+    return rows.sort_values(order, kind="stable", ignore_index=True)
 
 
 def append(
@@ -100,7 +100,10 @@ def append(
             warn(f"{commit[:12]}: left out, {error}")
             continue
         about = git("show", "-s", "--format=%ct %s", commit, folder=clone).partition(" ")
-        rows = rows.assign(commit=commit, committed_s=float(about[0]), subject=about[2])
+        depth = float(git("rev-list", "--count", "--first-parent", commit, folder=clone))
+        rows = rows.assign(
+            commit=commit, committed_s=float(about[0]), subject=about[2], depth=depth
+        )
         rows[["against", "step_ratio", "step_low", "step_high"]] = "", np.nan, np.nan, np.nan
         if speed is not None:
             old = checkout(speed, clone)
@@ -149,8 +152,8 @@ def trace(rows: pd.DataFrame) -> pd.DataFrame:
         for name, some in by_name.items():
             for metric in ERRORS:
                 found = findings.get((name, metric))
-                points.append({**which, "estimator": name, "metric": metric,
-                               **_error_of(starts[name], some, metric), **_mark_of(found)})  # fmt: skip
+                cells = {**_error_of(starts[name], some, metric), **_mark_of(found)}
+                points.append({**which, "estimator": name, "metric": metric, **cells})
             verdicts = {findings[name, e].verdict for e in ERRORS if name in old}
             if verdicts & {Change.WORSE, Change.BETTER, Change.CHANGED}:
                 changed[name] = some

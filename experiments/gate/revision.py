@@ -13,8 +13,9 @@ import json, sys
 from pathlib import Path
 from experiments.gate.suite import read_suite, run_suite
 path, names, reseed, options = json.loads(sys.argv[1])
-suite = read_suite(Path(path), *map(Path, options)).select(names)
-repeats = {entry.name: entry.repeats[0] for entry in suite.estimators if not entry.elsewhere}
+suite = read_suite(Path(path), *map(Path, options))
+chosen = [entry for entry in suite.estimators if not names or entry.name in names]
+repeats = {e.name: e.repeats[0] for e in chosen if not getattr(e, "elsewhere", False)}
 print(run_suite(suite, repeats, reseed=reseed).to_json(orient="records", double_precision=15))
 """
 
