@@ -64,7 +64,10 @@ def clone_of(file: Path) -> Path | None:
     """The clone that a file lies in; None for that of the running code."""
     if file.resolve().is_relative_to(paths.CONF.resolve()):
         return None
-    return Path(git("rev-parse", "--show-toplevel", folder=file.resolve().parent))
+    for folder in file.resolve().parents:
+        if (folder / ".git").exists():
+            return folder
+    raise InputError(f"{file}: in no git repository, so its commits cannot be run")
 
 
 def checkout(revision: str, folder: Path | None = None) -> Checkout:

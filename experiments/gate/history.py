@@ -4,6 +4,7 @@ A Parquet file keeps the rows of every commit that was appended. A commit is jud
 gate beside the last one at which the estimator changed, so that steps too small to be seen add up.
 """
 
+import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -47,7 +48,7 @@ def read_history(path: Path) -> pd.DataFrame:
     InputError
         If it is missing or damaged.
     """
-    require(path.exists(), f"{path}: no history yet; estima history --append begins one")
+    require(path.exists(), f"{path}: no history yet; append a commit")
     rows = read_rows(path, f"restore it, e.g. git checkout -- {path}")
     for name in COLUMNS:
         require(name in rows, f"{path}: damaged (no column {name})")
@@ -99,11 +100,7 @@ def append(
             failed.append(commit)
             warn(f"{commit[:12]}: left out, {error}")
             continue
-        about = git("show", "-s", "--format=%ct %s", commit, folder=clone).partition(" ")
-        depth = float(git("rev-list", "--count", "--first-parent", commit, folder=clone))
-        rows = rows.assign(
-            commit=commit, committed_s=float(about[0]), subject=about[2], depth=depth
-        )
+        rows = rows.assign(commit=commit, **_about(commit, clone))
         rows[["against", "step_ratio", "step_low", "step_high"]] = "", np.nan, np.nan, np.nan
         if speed is not None:
             old = checkout(speed, clone)
@@ -117,11 +114,21 @@ def append(
     require(len(failed) < max(1, len(revisions)), f"{source.stem} runs at none of them")
 
 
+def _about(commit: str, clone: Path | None) -> dict[str, Any]:
+    """When a commit was made, how many it follows, and the first line of its message."""
+    head, _, message = git("cat-file", "-p", commit, folder=clone).partition("\n\n")
+    (committed,) = re.findall(r"^committer .* (\d+) \S+$", head, re.MULTILINE)
+    return {
+        "committed_s": float(committed),
+        "depth": float(len(git("rev-list", commit, folder=clone).splitlines())),
+        "subject": message.partition("\n")[0],
+    }
+
+
 def _folder_of(commit: str, clone: Path | None) -> Path:
     """Folder with the code of a commit: the clone itself if it holds just that."""
     place = clone or paths.SOURCE
-    is_clean = not git("status", "--porcelain", "--untracked-files=no", folder=place)
-    if is_clean and git("rev-parse", "HEAD", folder=place) == commit:
+    if not git("diff", "HEAD", folder=place) and git("rev-parse", "HEAD", folder=place) == commit:
         return place
     return checkout(commit, clone).folder
 

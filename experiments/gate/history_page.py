@@ -45,7 +45,7 @@ def run_history(
     """
     require(out is None or out.suffix == ".html", f"-o {out}: a page is .html")
     path = file or history_path(suite)
-    require(path.suffix == ".parquet", f"--file {path}: a history is .parquet")
+    require(path.suffix == ".parquet", f"{path}: a history is .parquet")
     if revisions:
         append(suite, revisions, path, speed, config_dir)
     rows = read_history(path)
