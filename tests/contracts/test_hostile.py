@@ -79,8 +79,10 @@ def test_cells_cannot_become_markup():
         (BOMB, r"aliases \(\*\) stand for more than 1000000 values"),
         ("a: " + "9" * 5000, r"not valid YAML"),
         ("a: !!bool x", r"not valid YAML"),
+        ('a: 1\nb: ["x\\0y"]', r"x\.yaml:2: holds a zero byte"),
+        ('a: {"x\\ud800": 1}', r"x\.yaml:1: holds a zero byte or half a character"),
     ],
-    ids=["twice", "deep", "endless", "bomb", "long number", "bad tag"],
+    ids=["twice", "deep", "endless", "bomb", "long number", "bad tag", "zero", "half"],
 )
 def test_yaml_out_of_bounds(tmp_path, text, words):
     path = tmp_path / "x.yaml"
