@@ -9,11 +9,14 @@ import zlib
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from experiments.report.export import as_text, to_markdown
 from experiments.runs import store
 from experiments.runs.console import exit_with, show
+from experiments.runs.row import read_parquet
 from experiments.sweeps.launch import _drop, prepare
 from sim.errors import InputError, printable
 from sim.formats.detect import read_any
@@ -158,3 +161,10 @@ def test_rows_that_cannot_be_read_now_are_kept(tmp_path):
     assert path.exists()
     _drop(path, InputError("it does not match its checksum"))
     assert not path.exists()
+
+
+def test_a_column_that_is_there_twice_is_refused(tmp_path):
+    table = pa.Table.from_arrays([pa.array([1]), pa.array([2])], names=["seed", "seed"])
+    pq.write_table(table, tmp_path / "x.parquet")
+    with pytest.raises(InputError, match=r"x\.parquet: .*seed is there twice"):
+        read_parquet(tmp_path / "x.parquet")
