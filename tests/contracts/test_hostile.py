@@ -16,6 +16,7 @@ import pytest
 from experiments.report.export import as_text, to_markdown
 from experiments.runs import store
 from experiments.runs.console import exit_with, show
+from experiments.runs.dependencies.sources import _known
 from experiments.runs.row import read_parquet
 from experiments.sweeps.launch import _drop, prepare
 from sim.errors import InputError, printable
@@ -168,3 +169,8 @@ def test_a_column_that_is_there_twice_is_refused(tmp_path):
     pq.write_table(table, tmp_path / "x.parquet")
     with pytest.raises(InputError, match=r"x\.parquet: .*seed is there twice"):
         read_parquet(tmp_path / "x.parquet")
+
+
+def test_a_pipe_in_place_of_the_kept_sources(tmp_path):
+    os.mkfifo(tmp_path / "sources.json")
+    assert _known(tmp_path / "sources.json") == {}
