@@ -146,6 +146,7 @@ BAD = {
     "no_mean": ("print('{}', flush=True)", "must answer with mean, 3 numbers; got None"),
     "short": ("print('{\"mean\": [1, 2]}', flush=True)", "mean, 3 numbers"),
     "texts": ("print('{\"mean\": [\"1\", \"2\", \"3\"]}', flush=True)", "mean, 3 numbers"),
+    "true": ("print('{\"mean\": [true, 2, 3]}', flush=True)", "mean, 3 numbers"),
     "null": ("print('{\"mean\": [1, null, 3]}', flush=True)", "mean, 3 numbers"),
     "nan": ("print('{\"mean\": [NaN, 0, 0]}', flush=True)", "not a JSON object"),
     "covariance": (
