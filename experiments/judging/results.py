@@ -35,7 +35,7 @@ def write_table(frame: pd.DataFrame, path: Path) -> None:
 
 
 class Profile(StrEnum):
-    """The size of a study: `quick` makes all tables and figures from few repeats, on tuning seeds."""
+    """The size of a study: `quick` makes all from few repeats, on tuning seeds."""
 
     FULL = "full"
     QUICK = "quick"

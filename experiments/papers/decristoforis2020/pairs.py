@@ -11,7 +11,7 @@ import numpy as np
 from estimators.laser.icp import Rules, prepare, register
 from estimators.laser.scan_matching import FAILED
 from experiments.bench.icp import BEARINGS_RAD, pair
-from experiments.evaluation.registration_errors import METRICS, measure
+from experiments.evaluation.registration_errors import METRICS, measure, sample_scenes
 from experiments.judging.jobs import Tables
 from experiments.papers.decristoforis2020.settings import PLACES, WRONG_M
 from experiments.runs.experiment import Experiment

@@ -14,9 +14,13 @@ LABELS: dict[str, tuple[str, ...]] = {
     "resampling": ("resampling", "ess_share"),
     "noise": (),
 }
-QUICK_SEEDS = "range(1000,1002)"
+# Tables whose worlds are added until these claims are decided
+DESIGNED = {"particles": ["GI1", "GI3"], "laps": ["GI1"], "distance": ["GI4", "GI5"],
+            "association": ["GI7"]}  # fmt: skip
+N_QUICK = 2  # worlds of the quick profile
 CELL_M = 0.1  # of the occupancy grids
 N_REPEATS = {Profile.FULL: 20, Profile.QUICK: 2}  # of a run, or of the images over one drive
+MOST_PARTICLES = {Profile.FULL: 1000, Profile.QUICK: 100}  # of a region
 N_DRAWS = {Profile.FULL: 8, Profile.QUICK: 2}  # of the wheel errors
 N_TIMINGS = {Profile.FULL: 5, Profile.QUICK: 2}
 P0 = 1e-3  # in the rows of estimators without a p0
