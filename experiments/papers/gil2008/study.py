@@ -161,24 +161,16 @@ def region_run(name: str, values: Mapping[str, Any], seed: int, profile: Profile
     if name == "GI7":
         return _association_levels(given, seed)
     lines = ["study=gil2008", "estimator=fastslam_paper", *given]
-    recording, row = whole(Experiment.compose(lines)), Row()
-    most = settings.MOST_PARTICLES[profile]
-    arms = [(10, 10), (200, 3), (200, 10), (200, 20), (most, 10)]
-    for n, far_m in arms if profile is Profile.FULL else [(min(n, 50), m) for n, m in arms[:4]]:
-        one = Experiment.compose(
-            [*lines, f"estimator.n_particles={n}", f"sensors.stereo.max_distance_m={far_m}"]
-        )
-        row |= _levels(one, recording, f"m{n}_{far_m}m", stream(seed, "estimator/region"))
-    row |= _odometry(one, recording)
-    return row | _as_full(row, profile)
-
-
-def _as_full(row: Row, profile: Profile) -> Row:
-    """The quick profile's few particles under the names of the many."""
-    if profile is Profile.FULL:
-        return {}
-    few = {k.replace("m50_", "m200_"): v for k, v in row.items() if k.startswith("m50_")}
-    return few | {k.replace("m200_10m", "m1000_10m"): v for k, v in few.items() if "_10m" in k}
+    recording = whole(Experiment.compose(lines))
+    row, fewer = _odometry(Experiment.compose(lines), recording), settings.FEWER[profile]
+    for n, far_m in settings.REGION_ARMS:
+        keys = [
+            f"estimator.n_particles={fewer.get(n, n)}",
+            f"sensors.stereo.max_distance_m={far_m}",
+        ]
+        one, label = Experiment.compose([*lines, *keys]), f"m{n}_{far_m}m"
+        row |= _levels(one, recording, label, stream(seed, "estimator/region"))
+    return row
 
 
 def _levels(one: Experiment, recording: Recording, label: str, rng: np.random.Generator) -> Row:
