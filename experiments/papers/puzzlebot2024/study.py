@@ -8,7 +8,7 @@ import dataclasses
 import functools
 import itertools
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,8 +26,8 @@ from experiments.judging.remake import Cells, Remake, agrees, whole
 from experiments.judging.results import Profile, Results
 from experiments.papers.puzzlebot2024.descent import (
     convergence,
+    from_nine_runs,
     gradient_descent,
-    report_gradient_descent,
 )
 from experiments.papers.puzzlebot2024.ends import count_inside, ends_without_lag
 from experiments.papers.puzzlebot2024.settings import (
@@ -41,7 +41,6 @@ from experiments.papers.puzzlebot2024.settings import (
     LOOPS,
     N_CASES,
     NOMINAL,
-    REPORTS,
     SQUARE_RUNS,
     SQUARE_SAMPLES,
     TABLE_1_K_M,
@@ -341,23 +340,8 @@ def _calibration_rows(arm: Arm) -> Tables:
         for n, one in results
         for row in _found(one, arm.robot)
     ]
-    return {"calibration": parts + ([] if arm.joint else [*_reports_own(arm, run)])}
-
-
-def _reports_own(arm: Arm, run: Row) -> Iterator[Row]:
-    """Kr and kl by the report's program from nine runs: where its descent ends."""
-    rng = stream(arm.seed, "slip")
-    for parameter, axis in (("kl", 0), ("kr", 2)):  # from the straights, and from the turns
-        slips = []
-        for route in arm.routes.values():
-            _, omega, duration_s = route.segments[0]
-            end = run_batch(arm.robot, route, 1, rng).end_poses[0]
-            if (omega != 0.0) == (parameter == "kr"):
-                slips.append((end[axis] - route.ideal_end()[axis]) / duration_s)
-        limit = report_gradient_descent(0.0, slips, 1.0, n_iterations=10**5)[-1]
-        found = {"value": limit, "low": limit, "high": limit}
-        truth = {"parameter": parameter, "truth": getattr(arm.robot, parameter)}
-        yield {**run, "runs": N_CASES, "method": REPORTS, **truth, **found}
+    own = [] if arm.joint else [*from_nine_runs(arm.robot, arm.routes, arm.seed)]
+    return {"calibration": parts + [{**run, **row} for row in own]}
 
 
 def _found(result: CalibrationResult, robot: DifferentialDrive) -> list[Row]:
