@@ -76,9 +76,14 @@ class Case:
 
 
 def make_case(name: str, seed: int, *overrides: str) -> Case:
-    """World of a route; `oxford_real` has the real positions, `_plane` queries off the route."""
+    """World of a route; `oxford_real` has the real positions, `_plane` queries off the route.
+
+    The noise of its descriptors is that of the anchor, unless `overrides` has another.
+    """
     route, _, kind = name.partition("_")
-    lines = [f"study=maximo2024/{route}", f"seed={seed}", *overrides]
+    noise = anchored(name)["recording.noise_weight"]
+    lines = [f"study=maximo2024/{route}", f"seed={seed}", f"recording.noise_weight={noise}"]
+    lines += overrides
     if kind == "real":
         lines.append(f"positions='{POSITIONS}'")
     if kind == "plane":
@@ -100,7 +105,7 @@ def options(
     parameters
         sigma_l in node spacings, sigma_m, B.
     """
-    sigma_l, sigma_m, n_nearest = parameters or anchored(case.name)
+    sigma_l, sigma_m, n_nearest = parameters or _parameters(anchored(case.name))
     return {
         "weighting": method,
         "sigma_l_m": sigma_l * case.known_map.spacing_m,
@@ -109,12 +114,12 @@ def options(
     }
 
 
-def anchored(name: str) -> tuple[float, float, int]:
-    """sigma_l in node spacings, sigma_m and B at the anchor of a geometry."""
+def anchored(name: str) -> Mapping[str, Any]:
+    """The free settings at the anchor of a geometry; of a campus, UMH's."""
     place = PLACES.get(name.removesuffix("_plane"), "UMH")
     at = free_settings("maximo2024")["MX1"].printed[place].anchor
     require(at is not None, f"maximo2024/findings.yaml: MX1 has no anchor on {place}")
-    return _parameters(cast(Anchor, at).settings)
+    return cast(Anchor, at).settings
 
 
 @dataclass(frozen=True)

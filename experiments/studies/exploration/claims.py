@@ -1,8 +1,8 @@
 """The claim GI10: coordination explores better.
 
 A world is the unit of inference. Robots that share the frontiers out are judged against robots that
-each drive to the nearest one: by the area seen after the same distance, and by the error of the map that the
-paper's method makes of the drive.
+each drive to the nearest one: by the area seen after the same distance, and by the error of the map
+that the paper's method makes of the drive.
 """
 
 from collections.abc import Iterator
