@@ -5,7 +5,7 @@ python -m experiments.judging.anchors STUDY CLAIM [WORLDS]    # prints lines for
 
 import sys
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -44,7 +44,8 @@ def _levels(run: Run, values: Mapping[Any, Any], n_worlds: int) -> dict[str, flo
     """Each column's geometric mean over the worlds."""
     rows = [run(values, seed) for seed in range(n_worlds)]
     return {
-        name: float(np.exp(np.mean([np.log(float(row[name])) for row in rows]))) for name in rows[0]
+        name: float(np.exp(np.mean([np.log(cast(float, row[name])) for row in rows])))
+        for name in rows[0]
     }
 
 
