@@ -176,7 +176,7 @@ def test_pb4_names_the_k_at_which_the_band_is_left():
     assert "holds at least 95 %" in concluded("puzzlebot2024", judged).sentence
     assert [c.found.value for c in select_all(judged, quantity="held up to")] == [1e-4, 1e-4]
     lags = [c.found.value for c in select_all(judged, quantity="lag")]
-    assert lags == pytest.approx([-0.02] * 3)
+    assert lags == pytest.approx([-0.02] * 3, abs=1e-3)
     early = coverage.assign(k_m=coverage["k_m"] / 10.0)
     said = concluded("puzzlebot2024", claims.pb4(early, ends(0.0), cases))
     assert said.verdict == "not_reproduced"
@@ -311,10 +311,11 @@ def test_verdicts_are_whole_words():
 
 def test_intervals_of_two_one_sided_tests_are_named():
     worlds = pd.DataFrame(
-        [(s, n, 1.0 + 0.01 * s) for s in range(20) for n in (2, 4)],
+        [(s, n, 1.0 + 0.01 * s) for s in range(20) for n in (2, 4, 6, 8)],
         columns=["seed", "per_node", "error_m"],
     ).assign(geometry="umh")
     no_times = pd.DataFrame({"geometry": [], "particles": [], "time_s": []})
     tested = list(maximo2024.mx2(worlds, no_times))
+    tested = [claim for claim in tested if claim.about.quantity == "error"]
     assert tested
     assert all("(90 % interval)" in claim.statistic for claim in tested)

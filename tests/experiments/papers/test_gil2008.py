@@ -224,11 +224,11 @@ def test_studies_compose(name):
 
 
 def sweep(column, values, effect, *, rng=None, **constant):
-    """Rows of every world and value: an error of `effect(value)` with 10 % of noise."""
+    """Rows of every world and value: an error of `effect(value)` with 5 % of noise."""
     rng = rng or np.random.default_rng(0)
     rows = []
     for seed, value in itertools.product(SEEDS, values):
-        error = effect(value) * np.exp(0.1 * rng.standard_normal())
+        error = effect(value) * np.exp(0.05 * rng.standard_normal())
         row = {"seed": seed, "draw": 0, "noise": "paper", "filter": "fastslam2", **constant}
         rows.append(
             {
