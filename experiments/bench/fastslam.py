@@ -142,7 +142,9 @@ def cost_by_landmarks(n_repeats: int) -> pd.DataFrame:
     arms = itertools.product(range(n_repeats), _NS, ("shared", "contiguous"), ("known", "unknown"))
     for repeat, n, maps, ids in arms:
         size: dict[str, Any] = {"n_landmarks": n, "n_seen": 20, "n_steps": n // 2 + 60}
-        how = {} if ids == "known" else {"association": "mahalanobis", "d0": 7.81}
+        how: dict[str, Any] = {}
+        if ids == "unknown":
+            how = {"association": "mahalanobis", "d0": 7.81}
         seconds, _, _ = run_steps(1000, **size, maps=maps, **_PAPER, **how)
         ms = 1e3 * float(np.median(seconds[-50:]))  # in the second lap
         row = {"repeat": repeat, "maps": maps, "association": ids, "n_landmarks": n}

@@ -61,7 +61,7 @@ class Compared:
         """Log ratio of each row; not finite where a run failed."""
         below = table[self.second] if self.second else 1.0
         with np.errstate(divide="ignore", invalid="ignore"):
-            return np.log((table[self.first] / below).to_numpy(float))
+            return np.asarray(np.log((table[self.first] / below).to_numpy(float)))
 
     def side(self, effect: float) -> Side:
         """The claim's side, by the smallest effect of interest."""

@@ -7,6 +7,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from estimators.laser.icp import Rules, prepare, register
 from estimators.laser.scan_matching import FAILED
@@ -68,10 +69,8 @@ def covariance_levels(values: Mapping[str, Any], seed: int, n_repeats: int) -> R
     given = {"metrics": [values["estimator.metric"]]}
     rules = Rules(neighbours=int(values["estimator.neighbours"]))
     sigma = f"sensors.laser.sigma_range_m={values['sensors.laser.sigma_range_m']}"
-    rows = covariances_of(seed, values["place"], n_repeats, sigma, rules=rules, **given)[
-        "covariances"
-    ]
-    rows = rows.set_index("method")
+    made = covariances_of(seed, values["place"], n_repeats, sigma, rules=rules, **given)
+    rows = pd.DataFrame(made["covariances"]).set_index("method")
     return {
         f"{method}_{key}": float(np.exp(abs(np.log(value)))) if key == "off" else float(value)
         for method in ("hessian_points", "censi_last", "sampling")

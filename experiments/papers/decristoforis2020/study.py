@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import accumulate
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pandas as pd
@@ -163,7 +163,7 @@ def region_run(name: str, values: Mapping[str, Any], seed: int, profile: Profile
         rows = metrics_of(seed, values["pair of scans"], rules)["metrics"]
         kinds = {"point_to_plane": "plane", "point_to_point": "point"}
         return {
-            f"{kinds[row['metric']]}_{key}": max(float(row[key]), 1e-9)
+            f"{kinds[row['metric']]}_{key}": max(float(cast(float, row[key])), 1e-9)
             for row in rows
             if row["metric"] in kinds
             for key in ("error_m", "error_rad", "time_us")
@@ -171,10 +171,10 @@ def region_run(name: str, values: Mapping[str, Any], seed: int, profile: Profile
     if name == "DC2":
         (group,) = _planned("corridor", [seed], *overrides_at(values))
         row = _closeup([one for one in group if one.label("method") == "printed"])["ellipses"]
-        return dict(row.iloc[0].drop(["seed", "method"]))
+        return dict(pd.DataFrame(row).iloc[0].drop(["seed", "method"]))
     length_m = 20.0 if profile is Profile.FULL else 8.0
     (group,) = _planned("methods", [seed], *overrides_at(values), f"route.distance_m={length_m}")
-    runs = _drive(_only(PAPERS_OWN, group))["runs"].set_index("method")
+    runs = pd.DataFrame(_drive(_only(PAPERS_OWN, group))["runs"]).set_index("method")
     columns = ("ate_rmse_m", "heading_rmse_rad", "map_distance_m")
     return {f"{m}_{column}": float(runs.loc[m, column]) for m in PAPERS_OWN for column in columns}
 

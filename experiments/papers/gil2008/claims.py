@@ -421,7 +421,7 @@ def _printed(name: str, noise: str) -> bool:
 def _growth(table: pd.DataFrame, column: str) -> Array:
     """Ratio in each world (N,); a world's recordings are averaged first, in logs."""
     logs = np.log(table[column]).groupby(table["seed"]).mean().dropna()
-    return np.exp(logs.to_numpy())
+    return np.asarray(np.exp(logs.to_numpy()))
 
 
 def _kinds(

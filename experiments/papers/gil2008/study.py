@@ -73,7 +73,7 @@ def run(profile: Profile, out: Results, on_progress: Progress) -> None:
     for name, claims in settings.DESIGNED.items():
         tables |= run_worlds(
             "gil2008", claims, profile, partial(_worlds, name, profile),
-            lambda made, name=name: _judged(name, made),
+            partial(_judged, name),
         )  # fmt: skip
     on_progress(0.9)
     out.write_tables(**tables, cost=cost_by_landmarks(settings.N_TIMINGS[profile]))

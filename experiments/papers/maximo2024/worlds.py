@@ -276,7 +276,7 @@ def kidnapping_rows(
 
 def reference_run(values: Mapping[str, Any], seed: int) -> Row:
     """Level of M2, which the paper prints, on both routes at free settings."""
-    found = {}
+    found: Row = {}
     for place, case in _cases_at(values, seed, Profile.FULL):
         settings = options(case, "M2", _parameters(values))
         walk = localize(case, settings, stream(seed, "estimator/region"))
