@@ -431,9 +431,10 @@ def test_the_copy_holds_what_frames_show(recording, tmp_path):
 
 @pytest.mark.skipif(shutil.which("g++") is None, reason="no C++ compiler")
 def test_the_suite_of_a_cpp_program_runs(tmp_path, monkeypatch):
-    suite = read_suite(EXAMPLES / "cpp_gate" / "suite.yaml")
+    suite = read_suite(EXAMPLES / "own_gate" / "suite.yaml")
     overrides = (*suite.overrides["laser"], "route.distance_m=1", "sensors.laser.n_beams=11")
     suite = dataclasses.replace(suite, counts={"laser": 1}, overrides={"laser": overrides})
+    suite = suite.select(["my_odometry"])
     source = EXAMPLES / "external_odometry.cpp"
     subprocess.run(["g++", "-o", tmp_path / "external_odometry", source], check=True)
     monkeypatch.chdir(tmp_path)
