@@ -103,7 +103,7 @@ def _worlds(name: str, profile: Profile, seeds: Sequence[int]) -> Mapping[str, p
 
 
 def _is_headline(run: Experiment) -> bool:
-    """Whether a run is of the printed filter, or of EKF-SLAM beside it, at the printed noise."""
+    """Whether a run has the printed filter, or EKF-SLAM beside it, at the printed noise."""
     camera = sensor_of(run.sensors(), "stereo", StereoCamera)
     printed = run.options_of("estimator").get("noise_at") == "measured"
     return printed and not camera.correlated and not camera.max_observations
