@@ -20,7 +20,7 @@ from experiments.sweeps.plan import plan_experiments
 from tests.fixtures.claims import concluded
 from tests.fixtures.fakes import circle, tracking_prior, true_ids
 
-K_M = 5e-5
+K_M = 3.21e-5
 SEEDS = range(1000, 1020)
 PARTICLES = (10, 50, 100, 200, 300, 500, 1000)
 
