@@ -1,12 +1,8 @@
 """The claim GI9: sightings of one another make a team's localization better.
 
-<<<<<<< HEAD
-A world is the unit of inference. The paper's own method, FastSLAM, decides; EKF-SLAM and the batch
-baseline stand beside it, and what communication costs.
-=======
 A world is the unit of inference. The paper's own method, the printed filter with 200 particles,
-decides; FastSLAM 2.0, EKF-SLAM and the batch bound stand beside it, and what communication costs.
->>>>>>> w_VERDICTS
+decides; FastSLAM 2.0, EKF-SLAM and the batch baseline stand
+beside it, and what communication costs.
 """
 
 from collections.abc import Iterator, Mapping
