@@ -17,7 +17,7 @@ from scipy.special import chdtri  # scipy.stats takes half a second to import
 
 from estimators.base import Prior
 from estimators.landmarks.stereo import NoiseAt, NoiseModel, StereoModel, TeamEyesOptions
-from estimators.wheels import ForwardSlipOptions
+from estimators.wheels import WheelOptions
 from sim.arrays import Array, Floats, Ints
 from sim.errors import require
 from sim.options import NonNegative, Positive, Probability, options
@@ -30,7 +30,7 @@ _BLIND_IMAGES = 100  # images without a landmark after which the status reports 
 
 
 @options("estimator")
-class LandmarkSlamOptions(ForwardSlipOptions, TeamEyesOptions):
+class LandmarkSlamOptions(WheelOptions, TeamEyesOptions):
     """What the filters of landmark SLAM have in common."""
 
     association: Association = "known"

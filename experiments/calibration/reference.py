@@ -13,7 +13,7 @@ from estimators.landmarks.ekf_slam import EkfSlam
 from estimators.laser.icp_odometry import IcpOdometry
 from estimators.laser.scan_matching import FAILED
 from experiments.evaluation.statistics import Interval, mean_interval
-from experiments.runs.evaluate import run_over
+from experiments.runs.evaluate import OnStep, run_over
 from sim.arrays import Array, Ints
 from sim.errors import require
 from sim.recording import Recording, WheelLog
@@ -55,8 +55,10 @@ def names_of(recording: Recording, *kinds: type) -> list[str]:
     return [name for name in recording.logs if isinstance(recording.sensors[name], kinds)]
 
 
-def reference_of(recording: Recording) -> Reference:
+def reference_of(recording: Recording, on_step: OnStep = None) -> Reference:
     """Return what the wheels can be compared with: truth, else scans, else landmarks.
+
+    `on_step` is called with the number of Frames done.
 
     Raises
     ------
@@ -72,13 +74,13 @@ def reference_of(recording: Recording) -> Reference:
         if dense or not lasers:
             return Reference(Source.TRUTH, stamps, poses, np.diff(stamps) <= _LONGEST_GAP_S)
     if lasers:
-        return register_scans(recording, lasers[0])
+        return register_scans(recording, lasers[0], on_step)
     require(cameras, "the log has no truth, no scans and no landmarks to compare its wheels with")
     name = cameras[0]
     prior = Prior(recording.robot, recording.sensors, np.zeros(3), _START)
     # online, and gated: a batch that starts from wrong wheels and misread landmarks ends anywhere
     mapper = EkfSlam(kr=3e-3, kl=3e-3, errors="invariant", gate_probability=1e-6, stereo=name)
-    found, _ = run_over(recording, mapper, prior, np.random.default_rng(0))
+    found, _ = run_over(recording, mapper, prior, np.random.default_rng(0), on_step=on_step)
     rows = np.flatnonzero(np.isin(found.stamps, recording.log(name).stamps))
     stamps = found.stamps[rows]
     return Reference(
@@ -86,7 +88,7 @@ def reference_of(recording: Recording) -> Reference:
     )
 
 
-def register_scans(recording: Recording, name: str) -> Reference:
+def register_scans(recording: Recording, name: str, on_step: OnStep = None) -> Reference:
     """Poses of a laser by registering each of its scans to the one before.
 
     What moves is the laser, as the log has its mount on the robot.
@@ -94,7 +96,7 @@ def register_scans(recording: Recording, name: str) -> Reference:
     prior = Prior(recording.robot, recording.sensors, np.zeros(3), _START)
     matcher = IcpOdometry(kr=3e-3, kl=3e-3, sigma_range_m=0.03, reference="previous", laser=name)
     keep = ("registration_status",)
-    found, _ = run_over(recording, matcher, prior, np.random.default_rng(0), keep)
+    found, _ = run_over(recording, matcher, prior, np.random.default_rng(0), keep, on_step)
     rows = np.flatnonzero(np.isin(found.stamps, recording.log(name).stamps))
     sound = [found.extras["registration_status"][i] not in FAILED for i in rows[1:]]
     return Reference(Source.SCANS, found.stamps[rows], found.means[rows], np.array(sound, bool))

@@ -44,6 +44,39 @@ def info(
             show(f"check       {warning}")
 
 
+def solve(
+    log: Log,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write.")],
+    relations: Annotated[
+        Path | None,
+        typer.Option(help="Relations to judge the path by; lines of t1 t2 x y z roll pitch yaw."),
+    ] = None,
+    robot: WhichRobot = None,
+    override: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="Override, such as estimator.kr=1e-3; repeat it."),
+    ] = None,
+) -> None:
+    """Find the path and the map of a log: check it, calibrate its robot, run graph SLAM.
+
+    The folder gets page.html, trajectory.tum, map.yaml and .pgm, recording.npz, calibration.yaml,
+    summary.json and summary.csv. Of a log of landmarks with ids the path is EKF-SLAM's. A truth
+    that the log has judges the path alone.
+
+    Examples
+    --------
+      estima solve fr079.log.gz -o fr079
+
+      estima solve fr079.log.gz -o fr079 --relations fr079.relations.gz
+
+      estima solve MRCLAM_Dataset6.tar.xz --robot 3 -o robot3
+    """
+    from experiments.solve import as_text, solve_log
+
+    row = solve_log(log, out, relations, robot, override or ())
+    show(as_text(row, out))
+
+
 def convert(
     log: Log,
     out: Annotated[

@@ -1,7 +1,7 @@
 """A real robot's calibration: the YAML file of `estima calibrate LOG`, and its use."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -20,6 +20,9 @@ from sim.sensors.base import Sensor
 from sim.yaml_file import read_yaml
 
 Delay = Annotated[float, Field(gt=-60.0, lt=60.0), "a number of seconds below a minute"]
+
+
+BELIEVED = ("kr", "kl", "forward_slip_m")  # options of estimators
 
 
 @options("wheels")
@@ -139,6 +142,30 @@ def _corrected(log: Log, belief: SensorBelief) -> Log:
         if name in values:
             values[name] = (values[name] / belief.scale).astype(values[name].dtype)
     return dataclasses.replace(log, stamps=log.stamps + belief.delay_s, values=values)
+
+
+def read_calibrations(given: Any) -> list[Calibration]:
+    """Read what the key `calibration` names: nothing, a file, or a list of one a robot of a team.
+
+    Raises
+    ------
+    InputError
+        As `read_calibration`, or if it is something else.
+    """
+    files = given if isinstance(given, Sequence) and not isinstance(given, str) else [given]
+    require(
+        all(isinstance(file, str) and file for file in files) or given is None,
+        f"calibration must be a path, a list of one path a robot of a team, or null, got {given!r}",
+    )
+    return [] if given is None else [read_calibration(Path(file)) for file in files]
+
+
+def mean_slip(calibrations: Sequence[Calibration]) -> dict[str, float]:
+    """What an estimator can believe of the slip: one law for all robots, the mean of theirs."""
+    return {
+        key: sum(getattr(each.slip, key) for each in calibrations) / len(calibrations)
+        for key in BELIEVED
+    }
 
 
 def read_calibration(path: Path) -> Calibration:

@@ -16,7 +16,7 @@ from estimators.base import Estimator, Prior, TeamEstimator
 from estimators.programs.host import Isolated
 from experiments.evaluation.metrics import SCORED_EXTRAS
 from experiments.runs.cache import fetch_or_make
-from experiments.runs.calibration import read_calibration
+from experiments.runs.calibration import read_calibrations
 from experiments.runs.console import warn
 from experiments.runs.dependencies.recorder import Digests, note_unloaded, recorded
 from experiments.runs.key import recording_key
@@ -203,7 +203,7 @@ class Objects:
                 f"recording: {wanted['_target_']} must return a Recording, "
                 f"got {type(made).__name__}",
             )
-            return Team((self._calibrated(made),))
+            return self._calibrated(Team((made,)))
         if wanted is not None:
             return self._loaded(Path(wanted))
 
@@ -241,13 +241,13 @@ class Objects:
         team = load(path)
         if self.team is not None:
             require(self.size <= len(team), f"{path}: a team of {len(team)} robots; set team.size")
-            return team if self.size == len(team) else team.first(self.size)
+            return self._calibrated(team if self.size == len(team) else team.first(self.size))
         try:
             recording = team.only
         except InputError as error:
             raise InputError(f"{path}: {error}") from error
         self._compare_slip(recording)
-        return Team((self._calibrated(self._with_classes(recording)),))
+        return self._calibrated(Team((self._with_classes(recording),)))
 
     def check_size(self, team: Team) -> None:
         """Check that there is a recording for each robot of the experiment.
@@ -285,10 +285,18 @@ class Objects:
         )
         return estimator
 
-    def _calibrated(self, recording: Recording) -> Recording:
-        """Return the recording as the calibration has it."""
-        path = self.config["calibration"]
-        return recording if path is None else read_calibration(Path(path)).apply_to(recording)
+    def _calibrated(self, team: Team) -> Team:
+        """Return the recordings as the calibration has them: each by its own, or all by one."""
+        found = read_calibrations(self.config["calibration"])
+        if not found:
+            return team
+        require(
+            len(found) in (1, len(team)),
+            f"calibration: {len(found)} files for a team of {len(team)}; give one, or one a robot",
+        )
+        own = found * len(team) if len(found) == 1 else found
+        moved = [each.apply_to(robot) for each, robot in zip(own, team.robots, strict=True)]
+        return Team.on_one_clock(moved)
 
     def _with_classes(self, recording: Recording) -> Recording:
         """Return the recording with the classes of its sensors that the configuration names too."""

@@ -222,7 +222,7 @@ def _in_mm(range_m: ArrayLike) -> Array:
 
 
 def _spikes(ranges_m: Array) -> list[tuple[float, bool]]:
-    """Values, m, the greatest first, that ranges (M, n) have far too often; and if all beyond count.
+    """Values, m, greatest first, that ranges (M, n) have far too often; and if all beyond count.
 
     A wall is spread over neighbouring values by noise, and seen by few beams for long; what
     stands for nothing seen is one value, or a few codes next to each other. If next to nothing
