@@ -1,9 +1,9 @@
 """From a log to an answer: `estima solve`.
 
-A log is checked, the robot calibrated on it, and its path found by graph SLAM, or by EKF-SLAM where
-it saw landmarks and has no laser. Beside the path a folder gets the map, and one page that says what
-was believed and what of the log was used. The log's truth, if it has one, is not looked at before
-the path is there.
+A log is checked, the robot calibrated on it, and its path found by graph SLAM, or by EKF-SLAM
+where it saw landmarks and has no laser. Beside the path a folder gets the map, and one page that
+says what was believed and what of the log was used. The log's truth, if it has one, is not looked
+at before the path is there.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from experiments.calibration.files import residual_figure
 from experiments.calibration.from_log import LogCalibration, calibrate_against
 from experiments.calibration.log_check import check_calibration, check_clocks
 from experiments.calibration.reference import names_of, reference_of
-from experiments.evaluation.metrics import path_scores, travelled_m
+from experiments.evaluation.metrics import SCORED_EXTRAS, path_scores, travelled_m, unused_share
 from experiments.evaluation.relations import relation_scores
 from experiments.report.page import render
 from experiments.runs.calibration import write_calibration
 from experiments.runs.console import progress, show
-from experiments.runs.evaluate import run_over, status_of
+from experiments.runs.evaluate import WARNED_SHARE, run_over, status_of
 from experiments.runs.experiment import Experiment
 from experiments.runs.processes import hold_interrupts
 from experiments.runs.row import Row
@@ -54,8 +54,6 @@ from sim.sensors import Laser, StereoCamera
 from sim.worlds.grid import OccupancyGrid
 from sim.worlds.grid_file import write_grid
 
-WARNED_SHARE = 0.1  # of scans that were not used
-_USED = ("first", "ok", "degenerate")  # registration statuses
 _START = np.diag([1e-6] * 3)  # covariance of the origin
 # Of landmarks: ids are misread, and a camera's errors last from image to image
 _LANDMARKS = (
@@ -173,7 +171,7 @@ def solve(
             estimator,
             prior,
             stream(experiment.seed, f"estimator/{name}"),
-            ("registration_status", "associations"),
+            SCORED_EXTRAS,
             lambda n: (interrupt(), on_step(n)),
         )
     interrupt()
@@ -245,17 +243,13 @@ def _without_closures(estimator: GraphSlam, path: Estimate) -> Estimate:
 
 def _used(online: Estimate, closures: Array, lasers: list[str]) -> Row:
     """How many readings were used."""
+    row: Row = {"unused_share": unused_share(online) or 0.0}
     if not lasers:
         seen = [a for a in online.extras.get("associations", ()) if a is not None]
-        counted = np.concatenate([np.zeros(0, int), *seen])
-        n, unused = len(counted), int(np.sum(counted < 0))
-        return {"n_sightings": n, "unused_share": unused / max(n, 1)}
+        return row | {"n_sightings": sum(map(len, seen))}
     given = [s for s in online.extras.get("registration_status", ()) if s is not None]
-    counts = {name: given.count(name) for name in sorted(set(given))}
-    unused = sum(count for name, count in counts.items() if name not in _USED)
-    row: Row = {"n_scans": len(given), "unused_share": unused / max(len(given), 1)}
-    row |= {f"scans_{name}": count for name, count in counts.items()}
-    return row | {"n_closures": len(closures)}
+    row |= {f"scans_{name}": given.count(name) for name in sorted(set(given))}
+    return row | {"n_scans": len(given), "n_closures": len(closures)}
 
 
 def _numbers(found: LogCalibration | None) -> Row:
@@ -265,7 +259,7 @@ def _numbers(found: LogCalibration | None) -> Row:
 
 
 def scores_of(solved: Solved, relations: Relations | None) -> Row:
-    """Errors of the path by relations, and after alignment by the log's truth, where there are any."""
+    """Errors of the path by relations, and by the log's truth after alignment, if there is any."""
     path, recording = solved.path, solved.recording
     row: Row = {
         "duration_s": recording.duration_s,
@@ -366,8 +360,8 @@ def as_text(row: Mapping[str, Any], out: Path) -> str:
         lines.append(f"sightings   {row['n_sightings']}, {share} used")
     if "n_relations" in row:
         lines.append(
-            f"relations   {row['n_relations']:.0f}: {row['translation_mean_m']:.4f} m, "
-            f"{np.degrees(row['rotation_mean_rad']):.3f} degrees in the mean"
+            f"relations   {row['n_relations']:.0f}: {row['relation_translation_m']:.4f} m, "
+            f"{np.degrees(row['relation_rotation_rad']):.3f} degrees in the mean"
         )
     if "ate_aligned_rmse_m" in row:
         lines.append(f"truth       {row['ate_aligned_rmse_m']:.4f} m RMS, aligned")

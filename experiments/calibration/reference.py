@@ -106,7 +106,8 @@ def wheel_delay_s(wheels: WheelLog, reference: Reference) -> Interval:
     """What to add to the stamps of the wheels so that they turn when the reference turns.
 
     The delay at which the turns of both correlate best, over steps of at least a tenth of a second;
-    the interval is that of the mean over eight parts of the log.
+    the interval is that of the mean over eight parts of the log, and all that was tried where fewer
+    than two of these show a delay.
     """
     rows = spaced_rows(reference.stamps, 0.1)
     stamps, heading = reference.stamps[rows], np.unwrap(reference.poses[rows, 2])
@@ -131,8 +132,9 @@ def wheel_delay_s(wheels: WheelLog, reference: Reference) -> Interval:
     whole = best(known)
     require(math.isfinite(whole), "the robot never turned; a calibration needs turns and straights")
     parts = np.array([best(part) for part in np.array_split(known, N_PARTS)])
-    spread = mean_interval(parts[np.isfinite(parts)])
-    half = (spread.high - spread.low) / 2.0
+    shown = parts[np.isfinite(parts)]
+    spread = mean_interval(shown) if len(shown) > 1 else None
+    half = LARGEST_DELAY_S if spread is None else (spread.high - spread.low) / 2.0
     whole = round(whole / _DELAY_STEP_S) * _DELAY_STEP_S  # no rounding errors of the steps
     return Interval(whole, whole - half, whole + half)
 

@@ -77,6 +77,23 @@ def solve(
     show(as_text(row, out))
 
 
+@dataclass(frozen=True)
+class KeptPart:
+    """What of a log is converted."""
+
+    truth: Annotated[
+        Path | None,
+        typer.Option(help="Trajectory to take for the truth: .tum, .csv, .mcap, .bag."),
+    ] = None
+    from_s: Annotated[
+        float | None, typer.Option("--from", help="Where it begins, s after the first Frame.")
+    ] = None
+    until_s: Annotated[
+        float | None, typer.Option("--until", help="Where it ends, s after the first Frame.")
+    ] = None
+
+
+@gathered
 def convert(
     log: Log,
     out: Annotated[
@@ -92,6 +109,8 @@ def convert(
     topic: Annotated[
         str | None, typer.Option(help="Of a bag, the nav_msgs/Odometry to convert alone.")
     ] = None,
+    *,
+    kept: KeptPart,
 ) -> None:
     """Convert a log to a recording, or a recording or an estimate to a standard file.
 
@@ -109,15 +128,20 @@ def convert(
 
       estima convert MRCLAM_Dataset6.tar.xz --team -o team.npz
 
+      estima convert run.mcap --truth reference.tum --from 12 --until 300 -o run.npz
+
       estima convert estimate.csv -o estimate.tum
     """
     from experiments.trajectories.convert import convert_log, convert_team
+    from experiments.trajectories.part import WHOLE, Part
 
+    part = Part(kept.truth, kept.from_s, kept.until_s)
     if whole:
         require(robot is None, "--team takes all robots; leave out --robot")
+        require(part == WHOLE, "--truth, --from and --until are for one robot; leave out --team")
         print(convert_team(log, out))
     else:
-        print(convert_log(log, out, robot, topic))
+        print(convert_log(log, out, robot, topic, part))
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,24 @@ CHI2_95_2DOF = 5.991464547107979  # 95 % quantile of chi-square with two degrees
 _SINGULAR = 1e-10  # least eigenvalue of a correlation matrix that can be trusted
 RPE_DISTANCES_M = (1.0, 10.0)
 LONGEST_GAP_S = 0.25  # of the truth, over which it is interpolated
-SCORED_EXTRAS = ("dispersion_m",)  # Belief extras that `score` reads, of estimators that have them
+# Belief extras that `score` reads, of estimators that have them
+SCORED_EXTRAS = ("dispersion_m", "registration_status", "associations")
+CHI2_95_3DOF = 7.814727903251179  # 95 % quantile of chi-square with three degrees of freedom
+_USED = ("first", "ok", "degenerate")  # registration statuses
+
+
+def unused_share(estimate: Estimate) -> float | None:
+    """Share of the scans that were not registered or gated, and of the sightings rejected.
+
+    None for a method that does not say.
+    """
+    extras = estimate.extras
+    scans = [s for s in extras.get("registration_status", ()) if s is not None]
+    images = [np.asarray(a) for a in extras.get("associations", ()) if a is not None]
+    used = np.array([status in _USED for status in scans], bool)
+    if not scans and images:
+        used = np.concatenate(images) >= 0
+    return 1.0 - float(used.mean()) if len(used) else None
 
 
 def longest_pause_s(stamps: Array, start: float, end: float) -> float:
@@ -166,6 +183,8 @@ def score(
     dispersions = [v for v in estimate.extras.get("dispersion_m", ()) if v is not None]
     if dispersions:
         row["dispersion_final_m"] = float(dispersions[-1])
+    if (unused := unused_share(estimate)) is not None:
+        row["unused_share"] = unused
     if recording.truth is None:
         return row
     truth = recording.truth_at(estimate.stamps, longest_gap_s)
@@ -209,6 +228,8 @@ def path_scores(truth: Array, means: Array, covariances: Array) -> dict[str, flo
         row["ellipse_area_final_m2"] = float(ellipse_area_m2(covariances[-1:])[0])
     if counted.any():
         row["nees_mean"] = float(np.mean(values[counted]))
+        row["nees_median"] = float(np.median(values[counted]))
+        row["nees_covered_share"] = float(np.mean(values[counted] <= CHI2_95_3DOF))
     if row.get("ellipse_area_final_m2", 0.0) > 0.0:
         row["final_in_ellipse"] = float(in_ellipse(truth[-1], means[-1], covariances[-1]))
     for distance in RPE_DISTANCES_M:

@@ -66,7 +66,7 @@ def judged_relations(
 def relation_scores(
     recording: Recording, relations: Relations, stamps: Array, poses: Array
 ) -> dict[str, float]:
-    """Errors of poses (T, 3) at stamps (T,) by a log's relations, as `RelationErrors.summary`.
+    """Mean errors of poses (T, 3) at stamps (T,) by a log's relations, as columns of a row.
 
     Of a log that was thinned only scans count whose stamps are known.
     """
@@ -78,7 +78,12 @@ def relation_scores(
             "stamps_known of the recording must be rows of its scans",
         )
         relations = judged_relations(relations, log.stamps[rows])
-    return relation_errors(relations, stamps, poses).summary()
+    found = relation_errors(relations, stamps, poses).summary()
+    return {
+        "n_relations": found["n_relations"],
+        "relation_translation_m": found["translation_mean_m"],
+        "relation_rotation_rad": found["rotation_mean_rad"],
+    }
 
 
 def relation_errors(

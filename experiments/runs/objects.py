@@ -377,8 +377,9 @@ def _true_start(recording: Recording) -> Array:
     require(
         bool(np.isfinite(start).all()),
         f"the first Frame is at {begin_s:.2f} s, and the truth spans {spans[0]:.2f} to "
-        f"{spans[1]:.2f} s: no start pose is known; cut the recording to the time of its truth, "
-        "or set prior.start=global",
+        f"{spans[1]:.2f} s: no start pose is known; cut the log to its truth with `estima convert "
+        f"LOG --from {max(float(spans[0]) - begin_s, 0.0):.2f} -o FILE.npz`, or set "
+        "prior.start=global",
     )
     return start
 
