@@ -100,8 +100,8 @@ def match_and_align(recording: Recording, given: Estimate, how: Scoring) -> Scor
     """
     require(
         recording.truth is not None,
-        "this recording has no truth to score against; give one by `estima convert --truth`, or "
-        "--relations",
+        "this recording has no truth to score against; give it one with `estima convert`, or "
+        "relations",
     )
     stamps = given.stamps + how.offset_s
     rows: Rows

@@ -147,7 +147,7 @@ def convert_log(
     _check_output(log, out)
     if topic is not None or is_estimate(log):
         require(len(log) == 1, f"{log[0]}: an estimate is one file, got {len(log)}")
-        require(part == WHOLE, f"{log[0]}: an estimate takes no --truth, --from and --until")
+        require(part == WHOLE, f"{log[0]}: a truth and a part are for logs, not for estimates")
         estimate = read_trajectory(log[0], topic)
         write_estimate(out, estimate)
         seconds = estimate.stamps[-1] - estimate.stamps[0]

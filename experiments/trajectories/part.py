@@ -65,8 +65,8 @@ def _between(recording: Recording, low_s: float, high_s: float) -> Recording:
     stamps = stamps[(stamps >= low_s - 1e-9) & (stamps <= high_s + 1e-9)]
     require(
         len(stamps) >= 2,
-        f"--from {low_s - begin_s:g} --until {high_s - begin_s:g}: no two Frames lie in this part "
-        f"of the log's {end_s - begin_s:.6g} s",
+        f"no two Frames lie in the part from {low_s - begin_s:g} to {high_s - begin_s:g} s of the "
+        f"log's {end_s - begin_s:.6g} s",
     )
     wheels = recording.wheels.stamps
     wheels = wheels[(wheels >= stamps[0]) & (wheels <= stamps[-1])]
