@@ -62,6 +62,20 @@ _LANDMARKS = (
     "estimator.repeat_s=0.5",
 )
 
+Interrupt = Callable[[], None]  # raises when the user wants an end
+
+
+def _go_on() -> None:
+    """Nobody interrupts."""
+
+
+def _both(interrupt: Interrupt, on_step: Callable[..., None]) -> Callable[[int], None]:
+    def step(done: int) -> None:
+        interrupt()
+        on_step(done)
+
+    return step
+
 
 @dataclass(frozen=True)
 class Solved:
@@ -128,7 +142,7 @@ def solve_log(
 
 
 def solve(
-    recording: Recording, overrides: Sequence[str] = (), interrupt: Callable[..., None] = id
+    recording: Recording, overrides: Sequence[str] = (), interrupt: Interrupt = _go_on
 ) -> Solved:
     """Calibrate a robot on its log, and find its path.
 
@@ -151,7 +165,7 @@ def solve(
     found: LogCalibration | None = None
     try:
         with progress("calibrating", len(blind.frame_stamps)) as on_step:
-            reference = reference_of(blind, lambda n: (interrupt(), on_step(n)))
+            reference = reference_of(blind, _both(interrupt, on_step))
             found = calibrate_against(reference, blind)
     except InputError as error:
         warnings.append(f"not calibrated, the log's own values are believed: {error}")
@@ -172,7 +186,7 @@ def solve(
             prior,
             stream(experiment.seed, f"estimator/{name}"),
             SCORED_EXTRAS,
-            lambda n: (interrupt(), on_step(n)),
+            _both(interrupt, on_step),
         )
     interrupt()
     T_base_logged = _moved_base(blind, calibrated, lasers)
@@ -182,10 +196,12 @@ def solve(
         alone = _carried(_without_closures(estimator, path), T_base_logged)
         ties = np.array([(e.first, e.second) for e in estimator.graph.closures], int)
         closures = estimator.node_stamps[ties.reshape(-1, 2)]
-    row: Row = {"estimator": name, **_used(online, closures, lasers), **_numbers(found)}
+    unused = unused_share(online) or 0.0
+    row: Row = {"estimator": name, "unused_share": unused, **_counts(online, closures, lasers)}
+    row |= _numbers(found)
     status = status_of(calibrated, online, revised)
     row |= {"status": str(status.outcome), "status_detail": status.detail}
-    if (unused := row["unused_share"]) > WARNED_SHARE:
+    if unused > WARNED_SHARE:
         what = "scans" if lasers else "sightings"
         warnings.append(f"{name}: {100.0 * unused:.0f} % of the {what} were not used")
         show(f"warning     {warnings[-1]}")
@@ -241,15 +257,14 @@ def _without_closures(estimator: GraphSlam, path: Estimate) -> Estimate:
     return dataclasses.replace(path, means=se2.compose(estimator.graph.chained()[nodes], in_key))
 
 
-def _used(online: Estimate, closures: Array, lasers: list[str]) -> Row:
-    """How many readings were used."""
-    row: Row = {"unused_share": unused_share(online) or 0.0}
+def _counts(online: Estimate, closures: Array, lasers: list[str]) -> Row:
+    """How many readings there were, by what came of them."""
     if not lasers:
         seen = [a for a in online.extras.get("associations", ()) if a is not None]
-        return row | {"n_sightings": sum(map(len, seen))}
+        return {"n_sightings": sum(map(len, seen))}
     given = [s for s in online.extras.get("registration_status", ()) if s is not None]
-    row |= {f"scans_{name}": given.count(name) for name in sorted(set(given))}
-    return row | {"n_scans": len(given), "n_closures": len(closures)}
+    by_status: Row = {f"scans_{name}": given.count(name) for name in sorted(set(given))}
+    return {"n_scans": len(given), **by_status, "n_closures": len(closures)}
 
 
 def _numbers(found: LogCalibration | None) -> Row:
@@ -280,7 +295,7 @@ def scores_of(solved: Solved, relations: Relations | None) -> Row:
 
 
 def write_folder(
-    solved: Solved, row: Mapping[str, Any], out: Path, interrupt: Callable[..., None] = id
+    solved: Solved, row: Mapping[str, Any], out: Path, interrupt: Interrupt = _go_on
 ) -> None:
     """Write the recording, calibration, path, map and page of a log into a folder."""
     save(solved.recording, out / "recording.npz")
@@ -305,7 +320,7 @@ def write_folder(
                     path.means,
                     resolution_m=0.05,
                     laser=lasers[0],
-                    on_progress=lambda n, shown=on_step: (interrupt(), shown(n)),  # type: ignore[misc]
+                    on_progress=_both(interrupt, on_step),
                 )
             if name == "map":
                 write_grid(grid, out / "map.yaml")

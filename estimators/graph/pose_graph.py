@@ -154,6 +154,7 @@ class PoseGraph:
                 break
             sigma = max(sigma / _NARROWED, self._robust_sigma)
         n = len(self)
+        assert isinstance(solution.information, Factor)
         self._solved = self._now = solution.information
         self._cross = self._solved.columns(np.array([n - 1])).reshape(n, 3, 3)
         self._own[-1] = (self._cross[-1] + self._cross[-1].T) / 2.0

@@ -180,9 +180,12 @@ def run_over(
     BLAS uses one thread, or as many as ESTIMA_BLAS_THREADS says: its threads spin while they wait,
     and the matrices of filters are small.
     """
+    n_frames = len(recording.frame_stamps)
     with limit_blas():
         return run_and_finish(
-            estimator, lambda: run(estimator, recording, prior, rng, keep, on_step)
+            estimator,
+            lambda: run(estimator, recording, prior, rng, keep, on_step),
+            None if on_step is None else lambda: on_step(n_frames),
         )
 
 

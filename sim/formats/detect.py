@@ -145,8 +145,8 @@ def _format_of(path: Path) -> LogFormat:
     data = read_bytes(path)
     if _is_archive(data):
         return _format_of_names(list(read_members(path)), path)
-    head = data[:_HEAD_BYTES].split(b"\n")
-    lines = [line for line in head if line.strip() and not line.startswith(b"#")]
+    first = data[:_HEAD_BYTES].split(b"\n")
+    lines = [line for line in first if line.strip() and not line.startswith(b"#")]
     for each in FORMATS:
         if each.has_text(data, lines):
             return each
