@@ -87,11 +87,16 @@ def test_finish_says_that_it_goes_on_and_can_be_stopped(estimator):
     prior, calls = tracking_prior(recording), []
     run_over(recording, estimator, prior, np.random.default_rng(0), on_step=calls.append)
     assert calls.count(60) > 1  # the last Frame, and the steps of finish
-    with pytest.raises(KeyboardInterrupt), hold_interrupts() as interrupt:
 
-        def step(done):
-            if done == 60:
-                signal.raise_signal(signal.SIGINT)
-            interrupt()
+    def interrupted():
+        with hold_interrupts() as interrupt:
 
-        run_over(recording, estimator, prior, np.random.default_rng(0), on_step=step)
+            def step(done):
+                if done == 60:
+                    signal.raise_signal(signal.SIGINT)
+                interrupt()
+
+            run_over(recording, estimator, prior, np.random.default_rng(0), on_step=step)
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
