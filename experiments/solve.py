@@ -26,9 +26,9 @@ from matplotlib.figure import Figure
 from estimators.base import Estimate, Prior
 from estimators.graph.graph_slam import GraphSlam
 from experiments.calibration.files import residual_figure
-from experiments.calibration.from_log import LogCalibration, calibrate_against
+from experiments.calibration.from_log import LogCalibration, calibrate_log
 from experiments.calibration.log_check import check_calibration, check_clocks
-from experiments.calibration.reference import names_of, reference_of
+from experiments.calibration.reference import names_of
 from experiments.evaluation.metrics import SCORED_EXTRAS, path_scores, travelled_m, unused_share
 from experiments.evaluation.relations import relation_scores
 from experiments.report.page import render
@@ -165,8 +165,7 @@ def solve(
     found: LogCalibration | None = None
     try:
         with progress("calibrating", len(blind.frame_stamps)) as on_step:
-            reference = reference_of(blind, _both(interrupt, on_step))
-            found = calibrate_against(reference, blind)
+            found = calibrate_log(blind, on_step=_both(interrupt, on_step))
     except InputError as error:
         warnings.append(f"not calibrated, the log's own values are believed: {error}")
     else:

@@ -17,7 +17,13 @@ from estimators.base import Belief, Prior, TeamEstimator
 from estimators.gaussian import STILL, Gaussian, compose, wrap
 from estimators.landmarks.doubt import Doubt
 from estimators.landmarks.joint import JointGaussian, mahalanobis_squared
-from estimators.landmarks.sightings import Sightings, dead_reckoning, pose_by_points, team_starts
+from estimators.landmarks.sightings import (
+    Sightings,
+    dead_reckoning,
+    pair_nearest,
+    pose_by_points,
+    team_starts,
+)
 from estimators.landmarks.slam_frontend import Image, LandmarkSlamOptions, SlamFrontEnd
 from estimators.landmarks.stereo import MIN_DEPTH_M
 from estimators.wheels import NO_MOTION, GainOptions, gained_motion
@@ -74,9 +80,10 @@ class EkfSlam(EkfSlamOptions, TeamEstimator):
     Notes
     -----
     Extras: `associations` (K,): for each observation, counted from 0 over the whole run, the one
-    that started its landmark, itself if it is the first, -1 if it was rejected; with `keep_map`
-    also `landmarks` (N, 3) and `landmark_covariances` (N, 3, 3); `wheel_gains` (3,), g_r, g_l and
-    g_b, where they are states; `status` when an image was not used.
+    that started its landmark, itself if it is the first, -1 if it was rejected, -2 if its landmark
+    has just counted (`repeat_s`); with `keep_map` also `landmarks` (N, 3) and
+    `landmark_covariances` (N, 3, 3); `wheel_gains` (3,), g_r, g_l and g_b, where they are states;
+    `status` when an image was not used.
 
     A step costs O(K N^2): the whole covariance is touched. So the map holds at most 4000 landmarks;
     `status` says when it is full, and when an image has more than 1000 observations.
@@ -432,7 +439,7 @@ class EkfSlam(EkfSlamOptions, TeamEstimator):
         distances[:, predicted[:, 2] < MIN_DEPTH_M] = np.inf
         if numbers is not None:
             distances[numbers[:, None] != others] = np.inf
-        rows, columns = _matches(distances, self.sighting_d0)
+        rows, columns = pair_nearest(distances, self.sighting_d0)
         if len(rows):
             v, R = sightings.camera.innovation(predicted[columns], points[rows])
             self._update(own, at[columns], of_pose[columns], of_other[columns], v, R)
@@ -480,17 +487,6 @@ class EkfSlam(EkfSlamOptions, TeamEstimator):
 def _own(robot: int) -> slice:
     """Rows of a robot's pose in the state."""
     return slice(3 * robot, 3 * robot + 3)
-
-
-def _matches(distances: Array, d0: float) -> tuple[Ints, Ints]:
-    """Rows and columns of the least distances below d0, each row and column once."""
-    left, rows, columns = distances.copy(), [], []
-    while left.size and left.min() < d0:
-        row, column = np.unravel_index(int(np.argmin(left)), left.shape)
-        rows.append(row)
-        columns.append(column)
-        left[row], left[:, column] = np.inf, np.inf
-    return np.array(rows, np.int64), np.array(columns, np.int64)
 
 
 def _quarter_turned(points: Array) -> Array:

@@ -4,8 +4,7 @@ import math
 
 import numpy as np
 
-from experiments.calibration.from_log import LogCalibration, calibrate_against
-from experiments.calibration.reference import Source, reference_of, wheel_delay_s
+from experiments.calibration.from_log import LogCalibration, calibrate_log
 from sim.arrays import Array
 from sim.errors import InputError
 from sim.recording import Recording
@@ -22,17 +21,12 @@ def check_log(recording: Recording) -> list[str]:
     """Warnings, a line each; empty if nothing is odd.
 
     Wheels and sensors are checked of a log with a truth, scans or landmarks, against which
-    `calibrate_against` compares them.
+    `calibrate_log` compares them.
     """
     try:
-        reference = reference_of(recording)
-        delay_s = wheel_delay_s(recording.wheels, reference).value
+        compared = check_calibration(recording, calibrate_log(recording))
     except InputError as error:
-        return [*check_clocks(recording), f"wheels and sensors are not compared: {error}"]
-    try:
-        compared = check_calibration(recording, calibrate_against(reference, recording))
-    except InputError:
-        compared = _delay(delay_s, reference.source)
+        compared = [f"wheels and sensors are not compared: {error}"]
     return check_clocks(recording) + compared
 
 
@@ -89,17 +83,13 @@ def _clock(name: str, stamps: Array) -> list[str]:
     return warnings
 
 
-def _delay(delay_s: float, source: Source) -> list[str]:
-    if abs(delay_s) < DELAY_S:
-        return []
-    side = "ahead" if delay_s > 0.0 else "behind"
-    return [f"wheels: their stamps are {abs(delay_s):.2f} s {side}, against the {source}"]
-
-
 def check_calibration(recording: Recording, found: LogCalibration) -> list[str]:
     """Warnings where the wheels and the sensors of a log are not as it has them."""
     wheels, track_m = found.calibration.wheels, recording.robot.track_m
-    warnings, against = _delay(wheels.delay_s, found.source), f"against the {found.source}"
+    warnings, against = [], f"against the {found.source}"
+    if abs(wheels.delay_s) >= DELAY_S:
+        side = "ahead" if wheels.delay_s > 0.0 else "behind"
+        warnings.append(f"wheels: their stamps are {abs(wheels.delay_s):.2f} s {side}, {against}")
     for side, gain in (("right", wheels.gain_right), ("left", wheels.gain_left)):
         if abs(gain - 1.0) > GAIN:
             warnings.append(
@@ -110,6 +100,8 @@ def check_calibration(recording: Recording, found: LogCalibration) -> list[str]:
             f"wheels: they turn the robot as {wheels.track_m:.3f} m apart do, not {track_m:.3f} m"
         )
     for name, sensor in found.calibration.sensors.items():
+        if sensor.mirrored:
+            warnings.append(f"{name}: its beams run the other way: it is mounted upside down")
         if abs(sensor.scale - 1.0) > GAIN:
             longer = 100.0 * (sensor.scale - 1.0)
             warnings.append(f"{name}: ranges are {longer:+.1f} % off, {against}")

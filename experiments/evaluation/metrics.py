@@ -22,6 +22,7 @@ LONGEST_GAP_S = 0.25  # of the truth, over which it is interpolated
 SCORED_EXTRAS = ("dispersion_m", "registration_status", "associations")
 CHI2_95_3DOF = 7.814727903251179  # 95 % quantile of chi-square with three degrees of freedom
 _USED = ("first", "ok", "degenerate")  # registration statuses
+_AGAIN = -2  # of associations: the landmark had just counted
 
 
 def unused_share(estimate: Estimate) -> float | None:
@@ -34,7 +35,8 @@ def unused_share(estimate: Estimate) -> float | None:
     images = [np.asarray(a) for a in extras.get("associations", ()) if a is not None]
     used = np.array([status in _USED for status in scans], bool)
     if not scans and images:
-        used = np.concatenate(images) >= 0
+        seen = np.concatenate(images)
+        used = seen[seen != _AGAIN] >= 0
     return 1.0 - float(used.mean()) if len(used) else None
 
 

@@ -15,7 +15,7 @@ from sim.formats.assemble import frame_stamps
 from sim.options import NonNegative, Positive, build, options
 from sim.recording import Log, Recording, WheelLog
 from sim.robot.drive import RobotGeometry
-from sim.sensors import Laser, RobotCamera, StereoCamera
+from sim.sensors import Laser, Mount, RobotCamera, StereoCamera
 from sim.sensors.base import Sensor
 from sim.yaml_file import read_yaml
 
@@ -60,6 +60,8 @@ class SensorBelief:
     """Of its mount on the robot."""
     y_m: float | None = None
     yaw_rad: float | None = None
+    mirrored: bool | None = None
+    """Whether a laser is mounted upside down, so that its beams run the other way."""
     scale: Positive = 1.0
     """Logged range over true range."""
     delay_s: Delay = 0.0
@@ -125,7 +127,10 @@ def _believed(name: str, sensor: Sensor, belief: SensorBelief) -> Sensor:
     sigmas = {key: value for key, value in stated.items() if key.startswith("sigma")}
     strange = ", ".join(sigmas.keys() - {f.name for f in dataclasses.fields(sensor)})  # type: ignore[arg-type]
     require(not strange, f"calibration: {name}, a {type(sensor).__name__}, has no {strange}")
-    mounted = dataclasses.replace(sensor.mount, **mount)  # type: ignore[attr-defined]
+    logged: Mount = sensor.mount  # type: ignore[attr-defined]
+    if belief.mirrored:
+        mount = {"yaw_rad": -logged.yaw_rad, **mount}
+    mounted = dataclasses.replace(logged, **mount)
     changed: Sensor = dataclasses.replace(sensor, mount=mounted, **sigmas)  # type: ignore[type-var]
     return changed
 
@@ -141,6 +146,8 @@ def _corrected(log: Log, belief: SensorBelief) -> Log:
     for name in ("ranges_m", "points_in_camera"):
         if name in values:
             values[name] = (values[name] / belief.scale).astype(values[name].dtype)
+    if belief.mirrored and "ranges_m" in values:
+        values["ranges_m"] = values["ranges_m"][:, ::-1].copy()
     return dataclasses.replace(log, stamps=log.stamps + belief.delay_s, values=values)
 
 

@@ -33,13 +33,14 @@ from experiments.runs.seeds import stream
 from experiments.runs.targets import make
 from sim.arrays import Array
 from sim.errors import InputError, blaming, require, required
+from sim.formats.detect import read_all
 from sim.options import build
 from sim.people.walk import People
 from sim.recording import Frame, Recording
 from sim.robot.base import RobotGeometry, robot_from_config
 from sim.sensors import Sensor, Sensors, sensors_from_config
 from sim.sensors.base import RecordedSensor, sensor_settings
-from sim.team import Team, load
+from sim.team import Team
 from sim.worlds import grid_file
 from sim.worlds.world import World
 
@@ -239,7 +240,7 @@ class Objects:
 
     def _loaded(self, path: Path) -> Team:
         """The robots of a file, as they are believed to be."""
-        team = load(path)
+        team = read_all([path])
         if self.team is not None:
             require(self.size <= len(team), f"{path}: a team of {len(team)} robots; set team.size")
             return self._calibrated(team if self.size == len(team) else team.first(self.size))
