@@ -48,8 +48,7 @@ class EkfSlamOptions(LandmarkSlamOptions, GainOptions):
 
     doubt_sightings: Annotated[int, Field(ge=0, le=30)] = 10
     """With a gate: after so many sightings of known landmarks, four fifths of them rejected, the
-    pose on which those agree takes the place of the filter's: a turn that the wheels did not show
-    would else lock it out. 0: never."""
+    pose on which those agree replaces the filter's, which a turn unseen by the wheels locks out."""
     errors: Errors = "coordinates"
     """What the covariance describes. `coordinates`: the differences of headings and positions.
     `invariant`: the turn and shift of the whole map about the origin of the map frame, and what is
@@ -326,9 +325,7 @@ class EkfSlam(EkfSlamOptions, TeamEstimator):
     def _shear(self, sign: float) -> None:
         """Make the covariance of a motion of the whole map that of coordinates, or (-1) back."""
         P = self._state.covariance
-        blocks = _quarter_turned(self._state.mean.reshape(-1, 3))
-        blocks[0, 2] = 0.0
-        arm = sign * blocks.ravel()
+        arm = sign * _quarter_turned(self._state.mean.reshape(-1, 3)).ravel()
         P += np.outer(arm, P[2])
         P += np.outer(P[:, 2], arm)
 

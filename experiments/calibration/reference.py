@@ -77,7 +77,9 @@ def reference_of(recording: Recording, on_step: OnStep = None) -> Reference:
         stamps, poses = stamps[inside], poses[inside]
         dense = len(stamps) > 2 and float(np.median(np.diff(stamps))) <= _LONGEST_GAP_S
         if dense or not lasers:
-            return Reference(Source.TRUTH, stamps, poses, np.diff(stamps) <= _LONGEST_GAP_S)
+            of_laser = recording.config.get("truth_of") == "laser"  # chained scan matches
+            source = Source.SCANS if of_laser else Source.TRUTH
+            return Reference(source, stamps, poses, np.diff(stamps) <= _LONGEST_GAP_S)
     if lasers:
         return register_scans(recording, lasers[0], on_step)
     require(cameras, "the log has no truth, no scans and no landmarks to compare its wheels with")
