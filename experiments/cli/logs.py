@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -73,6 +74,7 @@ def solve(
     """
     from experiments.solve import as_text, solve_log
 
+    signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGINT))  # end as by Ctrl-C
     row = solve_log(log, out, relations, robot, override or ())
     show(as_text(row, out))
 
