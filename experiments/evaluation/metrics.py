@@ -14,13 +14,13 @@ from sim.arrays import Array
 from sim.errors import require
 from sim.recording import Recording
 
+_CHI2_3DOF = {50: 2.365973884375338, 90: 6.251388631170325, 95: 7.814727903251179}  # quantiles
 CHI2_95_2DOF = 5.991464547107979  # 95 % quantile of chi-square with two degrees of freedom
 _SINGULAR = 1e-10  # least eigenvalue of a correlation matrix that can be trusted
 RPE_DISTANCES_M = (1.0, 10.0)
 LONGEST_GAP_S = 0.25  # of the truth, over which it is interpolated
 # Belief extras that `score` reads, of estimators that have them
 SCORED_EXTRAS = ("dispersion_m", "registration_status", "associations")
-CHI2_95_3DOF = 7.814727903251179  # 95 % quantile of chi-square with three degrees of freedom
 _USED = ("first", "ok", "degenerate")  # registration statuses
 _AGAIN = -2  # of associations: the landmark had just counted
 
@@ -231,7 +231,12 @@ def path_scores(truth: Array, means: Array, covariances: Array) -> dict[str, flo
     if counted.any():
         row["nees_mean"] = float(np.mean(values[counted]))
         row["nees_median"] = float(np.median(values[counted]))
-        row["nees_covered_share"] = float(np.mean(values[counted] <= CHI2_95_3DOF))
+        row |= {
+            f"inside_{percent}_share": float(np.mean(values[counted] <= most))
+            for percent, most in _CHI2_3DOF.items()
+        }
+        variances = np.diagonal(covariances[counted], axis1=1, axis2=2)
+        row["sharpness_m"] = rms(np.sqrt(variances[:, 0] + variances[:, 1]))
     if row.get("ellipse_area_final_m2", 0.0) > 0.0:
         row["final_in_ellipse"] = float(in_ellipse(truth[-1], means[-1], covariances[-1]))
     for distance in RPE_DISTANCES_M:
