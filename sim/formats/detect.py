@@ -197,7 +197,7 @@ def read_all(paths: Sequence[Path], robot: int | None = None) -> Team:
     require(len(set(paths)) == len(paths), f"{first}: named twice; its files differ")
     require(
         robot is None or log.read is read_mrclam,
-        f"{first}: {log.name} logs are of one robot; leave out --robot",
+        f"{first}: {log.name} logs hold one robot; leave out --robot",
     )
     of_robot = {"robot": robot} if robot is not None else {}
     recording = log.read(*paths, **of_robot)
