@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import hashlib
+import inspect
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, Protocol, TypeVar
@@ -255,23 +256,32 @@ def run(
     return journal.estimate()
 
 
-def run_and_finish(estimator: Estimator, run_online: Callable[[], Estimate]) -> Answer:
+def run_and_finish(
+    estimator: Estimator,
+    run_online: Callable[[], Estimate],
+    on_step: Callable[[], None] | None = None,
+) -> Answer:
     """Online estimate of an estimator's run, and the revised one of `finish`, or None.
+
+    `on_step` is called now and then by a `finish` that takes it.
 
     The online one has the processor time of all, `finish` included, but for compiling code.
     """
     begun = processor_s()
     online = run_online()
-    revised = finish(estimator, 1)
+    revised = finish(estimator, 1, on_step)
     own_s = processor_s() - begun
     spent_s = getattr(estimator, "program_seconds", own_s)  # without the transport to it
     return share_processor_time([online], revised, spent_s)[0]
 
 
-def finish(estimator: Any, n_robots: int) -> Sequence[Estimate | None]:
+def finish(
+    estimator: Any, n_robots: int, on_step: Callable[[], None] | None = None
+) -> Sequence[Estimate | None]:
     """Estimate of each robot that `finish` or `finish_team` gives, or None."""
     if n_robots == 1 and hasattr(estimator, "finish"):
-        return [estimator.finish()]
+        told = "on_step" in inspect.signature(estimator.finish).parameters
+        return [estimator.finish(on_step) if told else estimator.finish()]
     paths: Sequence[Estimate | None] = (
         estimator.finish_team() if hasattr(estimator, "finish_team") else [None] * n_robots
     )

@@ -40,7 +40,7 @@ class Odometry(OdometryOptions):
 
     def step(self, frame: Frame) -> Belief:
         """Compose the Frame's arc and add its covariance."""
-        _, variances = self._wheels.slip(frame)
+        travel_m, variances = self._wheels.slip(frame)
         increment, by_wheels = relative_motion(
             frame.wheel_increments_m, self._wheels.track_m, self.integration
         )
@@ -48,6 +48,8 @@ class Odometry(OdometryOptions):
         H, by_increment = se2.compose_jacobians(mean, increment)
         G = by_increment @ by_wheels
         covariance = H @ covariance @ H.T + G @ np.diag(variances) @ G.T
+        together = G.sum(axis=1)
+        covariance += self.forward_slip_m * travel_m.mean() * np.outer(together, together)
         self._belief = Gaussian(se2.compose(mean, increment), covariance)
         return Belief(self._belief.mean.copy(), covariance.copy())
 

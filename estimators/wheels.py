@@ -32,6 +32,9 @@ class WheelOptions:
     """Believed slip variance per metre of the right wheel, m (puzzlebot2024, eq. (5))."""
     kl: NonNegative = 1e-4
     """Believed slip variance per metre of the left wheel, m."""
+    forward_slip_m: NonNegative = 0.0
+    """Variance per metre of what both wheels slip together, m: it moves the robot without turning
+    it. Velocities that lag behind their stamps make such errors."""
     window_s: NonNegative = 0.05
     """Travel is netted over at least this time, so that encoder noise does not inflate it, s."""
 
@@ -42,15 +45,6 @@ class LateralSlipOptions(WheelOptions):
 
     lateral_slip_m: NonNegative = 1e-7
     """Variance per metre of sideways slip, m."""
-
-
-@options("estimator")
-class ForwardSlipOptions(WheelOptions):
-    """Wheels that slip together as well."""
-
-    forward_slip_m: NonNegative = 0.0
-    """Variance per metre of what both wheels slip together, m: it moves the robot without turning
-    it. Velocities that lag behind their stamps make such errors."""
 
 
 @options("estimator")
@@ -90,7 +84,7 @@ class WheelPrediction:
         Q = G (diag(kr |ds_r| + q_r, kl |ds_l| + q_l) + f |ds| 1 1^T) G^T + diag(0, s |ds|, 0)
 
     where q is tick^2 / 6 for a wheel that moved, else 0, |ds| is the mean of both wheels', f is
-    `forward_slip_m` and s is `lateral_slip_m`; each is zero for a method without that option.
+    `forward_slip_m` and s is `lateral_slip_m`, zero for a method without that option.
     `Gaussian.then` composes the motion with a belief: H Sigma H^T + G Q G^T (puzzlebot2024,
     eqs. (2) and (5)).
 
@@ -105,7 +99,7 @@ class WheelPrediction:
     def __init__(self, believed: WheelOptions, track_m: float) -> None:
         self.kr, self.kl, self.track_m = believed.kr, believed.kl, track_m
         self.lateral_slip_m: float = getattr(believed, "lateral_slip_m", 0.0)
-        self.forward_slip_m: float = getattr(believed, "forward_slip_m", 0.0)
+        self.forward_slip_m = believed.forward_slip_m
         self.encoder_tick_m: float = getattr(believed, "encoder_tick_m", 0.0)
         self._window = TravelWindow(believed.window_s)
 

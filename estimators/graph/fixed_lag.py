@@ -41,6 +41,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from estimators.base import Belief, Estimate, Prior
 from estimators.gaussian import STILL, Gaussian, between, wrap
+from estimators.graph.camera_residuals import camera_whitening, residuals_of
 from estimators.graph.landmark_drive import (
     FLOOR,
     LandmarkDrive,
@@ -48,7 +49,7 @@ from estimators.graph.landmark_drive import (
     read_observations,
     solve_drives,
 )
-from estimators.graph.least_squares import MIN_INFORMATION, camera_whitening, residuals_of
+from estimators.graph.least_squares import MIN_INFORMATION, OnStep
 from estimators.graph.matrices import inverse, times, transpose, whitening_of
 from estimators.landmarks.joint import JointGaussian
 from estimators.landmarks.stereo import StereoModel, StereoOptions
@@ -145,12 +146,12 @@ class FixedLag(FixedLagOptions):
         covariance = (self._belief.covariance + self._belief.covariance.T) / 2.0
         return Belief(self._belief.mean.copy(), covariance, {"status": status} if status else {})
 
-    def finish(self) -> Estimate:
+    def finish(self, on_step: OnStep = None) -> Estimate:
         """Least squares over all Frames so far, as `estimators.graph.smoother` solves it.
 
-        It starts from the online estimate.
+        It starts from the online estimate. `on_step` is called before each of its steps.
         """
-        return solve_drives([self._drive])[0]
+        return solve_drives([self._drive], on_step=on_step)[0]
 
     def _registered(self, frame: Frame) -> Gaussian | None:
         """Motion since the last image by the scans; None without both, or if that fails."""

@@ -15,10 +15,11 @@ import numpy as np
 
 from estimators.base import Estimate
 from estimators.gaussian import Gaussian, compose, stack, wrap
+from estimators.graph.camera_residuals import PoseSightings
 from estimators.graph.least_squares import (
     PLAIN_SQUARES,
     LeastSquaresOptions,
-    PoseSightings,
+    OnStep,
     Problem,
     solve,
 )
@@ -122,25 +123,26 @@ class LandmarkDrive:
         )
         return problem, ids
 
-    def fill_in(self, poses: Array, joint_covariance: Array) -> tuple[Array, Array]:
+    def fill_in(self, poses: Array, joints: Array, alone: Array) -> tuple[Array, Array]:
         """Means (T, 3) and covariances (T, 3, 3) of every Frame, between the solved ones too.
 
         Parameters
         ----------
         poses
             (N, 3) of the problem, solved.
-        joint_covariance
-            (3 N, 3 N); only that of neighbours is read.
+        joints
+            (N - 1, 6, 6) covariance of each with the next.
+        alone
+            (3, 3) that of the last.
         """
         rows = self._rows()
-        n, n_poses = len(self._stamps), len(rows)
+        n = len(self._stamps)
         means, covariances = np.empty((n, 3)), np.empty((n, 3, 3))
-        means[rows], each = poses, range(n_poses)
-        covariances[rows] = joint_covariance.reshape(n_poses, 3, n_poses, 3)[each, :, each]
+        means[rows], covariances[rows[:-1]] = poses, joints[:, :3, :3]
+        covariances[rows[-1]] = alone
         for pose, (a, b) in enumerate(itertools.pairwise(rows)):
-            block = slice(3 * pose, 3 * pose + 6)
-            joint, ends = joint_covariance[block, block], poses[pose : pose + 2]
-            between = _between(self._motions[a + 1 : b + 1], ends, joint)
+            ends = poses[pose : pose + 2]
+            between = _between(self._motions[a + 1 : b + 1], ends, joints[pose])
             for row, belief in enumerate(between, start=a + 1):
                 means[row], covariances[row] = belief.mean, belief.covariance
         return means, covariances
@@ -156,6 +158,7 @@ def solve_drives(
     how: LeastSquaresOptions = PLAIN_SQUARES,
     camera: Sightings | None = None,
     sighted: Sequence[Sighted] = (),
+    on_step: OnStep = None,
 ) -> list[Estimate]:
     """Least squares over all Frames so far of the drives of a team, in one map.
 
@@ -163,6 +166,8 @@ def solve_drives(
     ----------
     camera, sighted
         What sees the other robots, and what it saw; the Frames are pinned.
+    on_step
+        Called before each step.
 
     Returns
     -------
@@ -210,7 +215,7 @@ def solve_drives(
                 np.array([point for _, _, point in sighted]),
             )
             problem = dataclasses.replace(problem, sightings=sightings)
-    solution = solve(problem, np.concatenate(guesses), how)
+    solution = solve(problem, np.concatenate(guesses), how, on_step=on_step)
     known_map = {
         "ids": ids,
         "landmarks": solution.landmarks,
@@ -218,10 +223,10 @@ def solve_drives(
     }
     status = "ok" if solution.converged else "not_converged"
     status = status if len(ids) else "no_landmarks"
-    estimates = []
+    joints, estimates = solution.information.joints(), []
     for drive, (low, high) in zip(drives, itertools.pairwise(ends), strict=True):
-        covariance = solution.covariance[3 * low : 3 * high, 3 * low : 3 * high]
-        path = drive.fill_in(solution.poses[low:high], covariance)
+        alone = joints[high - 2, 3:, 3:] if high > 1 else solution.covariance
+        path = drive.fill_in(solution.poses[low:high], joints[low : high - 1], alone)
         estimates.append(Estimate(drive.stamps, *path, "revised", map=known_map, status=status))
     return estimates
 

@@ -1,7 +1,8 @@
 """Least squares over poses, relative poses and stereo landmarks, by Levenberg-Marquardt.
 
 Each step eliminates the landmarks (Schur complement), so that only the poses are left to
-factorise: as a dense matrix, or, where most of it is zero, as a sparse one. Shared by
+factorise: as a dense matrix, or, where most of it is zero, as a sparse one. Where the poses are a
+chain that is longer than the map is large, the poses are eliminated instead. Shared by
 `estimators.graph.smoother`, `estimators.graph.fixed_lag` and `estimators.graph.pose_graph`.
 
 The loss `dcs` is dynamic covariance scaling (Agarwal et al., Robust map optimization using dynamic
@@ -13,6 +14,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Literal
@@ -21,7 +23,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import bsr_array, csc_array
 
+from estimators.graph.camera_residuals import PoseSightings, camera_whitening, residuals_of
 from estimators.graph.matrices import (
+    Arrow,
     Factor,
     NormalEquations,
     inverse,
@@ -29,17 +33,17 @@ from estimators.graph.matrices import (
     transpose,
     whitening_of,
 )
-from estimators.landmarks.sightings import Sightings
-from estimators.landmarks.stereo import MIN_DEPTH_M, StereoModel
+from estimators.landmarks.stereo import StereoModel
 from sim import se2
 from sim.arrays import Array, Ints
 from sim.options import Count, Positive, options
 
 Robust = Literal["none", "huber", "cauchy", "dcs"]
+OnStep = Callable[[], None] | None
 
 MIN_INFORMATION = 1e-6  # wrong ids can send a landmark to infinity; a kilometre is enough
 _LEAST_DAMPING, _MOST_DAMPING = 1e-9, 1e6
-_SPARSE_POSES = 100  # without landmarks, from so many on the matrix is kept sparse
+_SPARSE_POSES = 100  # from so many on the matrix is kept sparse
 
 
 @options("estimator")
@@ -56,39 +60,6 @@ class LeastSquaresOptions:
 
 
 PLAIN_SQUARES = LeastSquaresOptions()
-
-
-@dataclass(frozen=True)
-class PoseSightings:
-    """Poses seen from poses: robots of a team that see one another's markers.
-
-    Attributes
-    ----------
-    sensor
-        What is believed of what sees them.
-    seeing_rows, seen_rows
-        (K,) who sees whom.
-    points_in_camera
-        (K, 3) m.
-    """
-
-    sensor: Sightings
-    seeing_rows: Ints
-    seen_rows: Ints
-    points_in_camera: Array
-
-    def residuals(self, poses: Array, in_image: bool) -> tuple[Array, Array, Array]:
-        """Whitened residuals (K, 3), and derivatives (K, 3, 3) by the seeing and seen pose."""
-        camera, seeing = self.sensor.camera, poses[self.seeing_rows]
-        markers, points = self.sensor.markers(poses[self.seen_rows]), self.points_in_camera
-        off, by_seeing, by_marker = residuals_of(camera, seeing, markers, points, in_image)
-        whitening = (
-            camera_whitening(camera, seeing, markers)
-            if in_image
-            else whitening_of(camera.covariance(points))
-        )
-        by_seen = by_marker * np.array([1.0, 1.0, 0.0])  # its heading is not seen
-        return times(whitening, off), whitening @ by_seeing, whitening @ by_seen
 
 
 @dataclass(frozen=True)
@@ -148,7 +119,7 @@ class Solution:
     """
 
     poses: Array
-    information: Factor
+    information: Factor | Arrow
     landmarks: Array
     landmark_covariances: Array
     cost: float
@@ -157,7 +128,7 @@ class Solution:
 
     @property
     def covariance(self) -> Array:
-        """(3 T, 3 T) of all poses jointly; `Factor.columns` gives a part of it for less."""
+        """(3 T, 3 T) of all poses jointly; `information` gives parts of it for less."""
         return self.information.inverse
 
 
@@ -167,8 +138,11 @@ def solve(
     how: LeastSquaresOptions = PLAIN_SQUARES,
     *,
     tolerance: float = 1e-9,
+    on_step: OnStep = None,
 ) -> Solution:
     """Least squares from guessed poses (T, 3), by Levenberg-Marquardt.
+
+    `on_step` is called before each step.
 
     Landmarks start where the observation with the greatest disparity puts them. The first stage
     fits triangulated points, the second what the camera measures. It ends when a step gains less
@@ -195,7 +169,7 @@ def solve(
     iterations, converged = 0, True
     last = (True, tolerance)
     for in_image, enough in [last] if n_landmarks == 0 else [(False, 1e-4), last]:
-        poses, landmarks, taken = _descend(residuals, poses, landmarks, in_image, enough)
+        poses, landmarks, taken = _descend(residuals, poses, landmarks, in_image, enough, on_step)
         iterations, converged = iterations + taken, taken < how.max_iterations
     poses = np.column_stack([poses[:, :2], se2.wrap(poses[:, 2])])
     whitening = residuals.whitening(poses, landmarks, True)
@@ -208,11 +182,18 @@ def information_at(problem: Problem, poses: Array, how: LeastSquaresOptions) -> 
     """Information about poses (T, 3), linearised where they are, of a problem without landmarks."""
     residuals = _Residuals(problem, np.zeros(1, np.int64), how)
     nothing = np.zeros((0, 3))
-    return residuals.linearised(poses, nothing, nothing[:, None], True).marginals()[0]
+    found = residuals.linearised(poses, nothing, nothing[:, None], True).marginals()[0]
+    assert isinstance(found, Factor)
+    return found
 
 
 def _descend(
-    residuals: _Residuals, poses: Array, landmarks: Array, in_image: bool, tolerance: float
+    residuals: _Residuals,
+    poses: Array,
+    landmarks: Array,
+    in_image: bool,
+    tolerance: float,
+    on_step: OnStep,
 ) -> tuple[Array, Array, int]:
     """Levenberg-Marquardt until a step gains less than this share of the cost.
 
@@ -225,6 +206,8 @@ def _descend(
     """
     damping, max_iterations = _LEAST_DAMPING, residuals.how.max_iterations
     for taken in range(max_iterations):
+        if on_step is not None:
+            on_step()
         whitening = residuals.whitening(poses, landmarks, in_image)
         system = residuals.linearised(poses, landmarks, whitening, in_image)
         while True:
@@ -268,6 +251,23 @@ class _Linearised:
     splits: Ints
     cost: float
 
+    @cached_property
+    def _is_chain(self) -> bool:
+        """Whether the poses are tied to the next one alone, and there are more than landmarks."""
+        n = len(self.g)
+        rows = np.repeat(np.arange(n), np.diff(self.H.indptr))
+        near = int(np.abs(self.H.indices - rows).max()) <= 1
+        return 0 < len(self.V) < n and n >= _SPARSE_POSES and near
+
+    def _arrow(self, damping: float) -> Arrow:
+        """Damped information of poses in a chain and of landmarks."""
+        H, V = self.H.copy(), self.V.copy()
+        rows = np.repeat(np.arange(len(self.g)), np.diff(H.indptr))
+        own, axes = np.flatnonzero(H.indices == rows)[:, None], np.arange(3)
+        H.data[own, axes, axes] *= 1.0 + damping
+        V[:, axes, axes] *= 1.0 + damping
+        return Arrow(H, self._by_landmark(self.W), V)
+
     def _reduced(self, damping: float) -> tuple[Factor, Array, Array]:
         """Damped information of the poses without the landmarks, V^-1 and W V^-1."""
         V = self.V.copy()
@@ -292,6 +292,10 @@ class _Linearised:
     def step(self, damping: float) -> tuple[Array, Array] | None:
         """Changes of the poses (T, 3) and landmarks (N, 3); None if it cannot be solved."""
         try:
+            if self._is_chain:
+                of_poses, of_landmarks = self._arrow(damping).step(-self.g, -self.h)
+                sound = np.isfinite(of_poses).all() and np.isfinite(of_landmarks).all()
+                return (of_poses, of_landmarks) if sound else None
             factor, V_inverse, WV = self._reduced(damping)
             rhs = self.g.copy()
             np.subtract.at(
@@ -308,8 +312,11 @@ class _Linearised:
         np.add.at(rest, self.problem.landmark_rows, turned)
         return of_poses, -times(V_inverse, rest)
 
-    def marginals(self) -> tuple[Factor, Array]:
+    def marginals(self) -> tuple[Factor | Arrow, Array]:
         """Information of the poses, and covariance (N, 3, 3) of each landmark."""
+        if self._is_chain:
+            arrow = self._arrow(0.0)
+            return arrow, arrow.of_landmarks
         factor, of_landmarks, WV = self._reduced(0.0)
         rows = 3 * self.problem.pose_rows[:, None] + np.arange(3)
         for n, (start, stop) in enumerate(itertools.pairwise(self.splits)):
@@ -436,44 +443,3 @@ class _Residuals:
             scale = np.minimum(1.0, 2.0 * turn / (turn + squares))
             return np.where(scale < 1.0, turn * (3.0 - 2.0 * scale), squares), scale**2
         return squares, np.ones_like(squares)
-
-
-def residuals_of(
-    camera: StereoModel, poses: Array, landmarks: Array, points: Array, in_image: bool = True
-) -> tuple[Array, Array, Array]:
-    """Residuals of K observations: predicted less measured.
-
-    In pixels of column, row and disparity if the camera's noise is Gaussian there and `in_image`
-    asks for it, else in metres.
-
-    Parameters
-    ----------
-    poses, landmarks, points
-        (K, 3) each: who sees which landmark, and where in the camera frame it was measured.
-
-    Returns
-    -------
-    tuple
-        Residuals (K, 3), and their derivatives (K, 3, 3) by the pose and by the landmark.
-    """
-    predicted, by_pose, by_landmark = camera.predict(poses, landmarks)
-    if not (in_image and camera.in_image):
-        return predicted - points, by_pose, by_landmark
-    # What is guessed to lie behind the camera is pulled before it
-    predicted[:, 2] = np.maximum(predicted[:, 2], MIN_DEPTH_M)
-    image = camera.to_image(predicted)
-    by_point = -image[:, :, None] * np.array([0.0, 0.0, 1.0])
-    by_point[:, 0, 0] = by_point[:, 1, 1] = camera.focal_px
-    by_point /= predicted[:, 2, None, None]
-    return image - camera.to_image(points), by_point @ by_pose, by_point @ by_landmark
-
-
-def camera_whitening(camera: StereoModel, poses: Array, landmarks: Array) -> Array:
-    """Matrices (K, 3, 3) that make the camera's residuals, `residuals_of`, unit white noise.
-
-    The noise is that at the predicted points where it is not the same everywhere.
-    """
-    if camera.in_image:
-        roots = np.diag(1.0 / np.sqrt(camera.variances_px2))
-        return np.broadcast_to(roots, (len(poses), 3, 3))
-    return whitening_of(camera.covariance(camera.predict(poses, landmarks)[0]))

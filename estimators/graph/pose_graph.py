@@ -154,6 +154,7 @@ class PoseGraph:
                 break
             sigma = max(sigma / _NARROWED, self._robust_sigma)
         n = len(self)
+        assert isinstance(solution.information, Factor)
         self._solved = self._now = solution.information
         self._cross = self._solved.columns(np.array([n - 1])).reshape(n, 3, 3)
         self._own[-1] = (self._cross[-1] + self._cross[-1].T) / 2.0
@@ -170,6 +171,16 @@ class PoseGraph:
         """(N, 3, 3) covariance of every node."""
         self._refresh(np.arange(len(self)))
         return self._own.copy()
+
+    def chained(self) -> Array:
+        """(N, 3) poses of the nodes by their ties to the one before alone."""
+        motions: list[Gaussian] = []
+        for edge in self._chain:
+            if edge.second == len(motions):
+                motions[-1] = motions[-1].fuse(edge.motion)
+            else:
+                motions.append(edge.motion)
+        return se2.chain(np.array([m.mean for m in motions]).reshape(-1, 3), self.poses[0])
 
     def _refresh(self, nodes: Ints) -> None:
         stale = np.asarray(nodes)[~self._current[nodes]]

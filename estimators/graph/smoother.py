@@ -16,7 +16,7 @@ from estimators.graph.landmark_drive import (
     read_observations,
     solve_drives,
 )
-from estimators.graph.least_squares import LeastSquaresOptions, Problem
+from estimators.graph.least_squares import LeastSquaresOptions, OnStep, Problem
 from estimators.landmarks.sightings import Sightings, dead_reckoning
 from estimators.landmarks.stereo import StereoModel, TeamEyesOptions
 from estimators.wheels import WheelOptions
@@ -80,13 +80,16 @@ class Smoother(SmootherOptions, TeamEstimator):
                     self._sighted.append((pins[0], pins[1], point))
         return beliefs
 
-    def finish(self) -> Estimate:
-        """Least squares over all Frames so far, see `estimators.graph.landmark_drive.revised`."""
-        return self.finish_team()[0]
+    def finish(self, on_step: OnStep = None) -> Estimate:
+        """Least squares over all Frames so far, see `estimators.graph.landmark_drive.solve_drives`.
 
-    def finish_team(self) -> list[Estimate]:
+        `on_step` is called before each of its steps.
+        """
+        return self.finish_team(on_step)[0]
+
+    def finish_team(self, on_step: OnStep = None) -> list[Estimate]:
         """Least squares over all Frames of a team: the path of each robot."""
-        return solve_drives(self._drives, self, self._sightings, self._sighted)
+        return solve_drives(self._drives, self, self._sightings, self._sighted, on_step)
 
     def problem(self) -> tuple[Problem, Array]:
         """The least-squares problem over all Frames so far, and poses (T, 3) to start from."""

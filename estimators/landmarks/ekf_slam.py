@@ -7,15 +7,23 @@ of all robots, and one map.
 
 import math
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from estimators.base import Belief, Prior, TeamEstimator
 from estimators.gaussian import STILL, Gaussian, compose, wrap
+from estimators.landmarks.doubt import Doubt
 from estimators.landmarks.joint import JointGaussian, mahalanobis_squared
-from estimators.landmarks.sightings import Sightings, dead_reckoning, pose_by_points, team_starts
+from estimators.landmarks.sightings import (
+    Sightings,
+    dead_reckoning,
+    pair_nearest,
+    pose_by_points,
+    team_starts,
+)
 from estimators.landmarks.slam_frontend import Image, LandmarkSlamOptions, SlamFrontEnd
 from estimators.landmarks.stereo import MIN_DEPTH_M
 from estimators.wheels import NO_MOTION, GainOptions, gained_motion
@@ -30,6 +38,7 @@ Errors = Literal["coordinates", "invariant"]
 _MOST_LANDMARKS, _MOST_OBSERVATIONS = 4000, 1000
 # Covariance of a robot that enters the map: wide, against what is measured then
 _ENTERS = np.diag(np.square([10.0, 10.0, 1.0]))
+_FORGOTTEN_M = 10.0  # deviation of a landmark that a lost robot has placed
 _REFINEMENTS = 5
 
 
@@ -37,6 +46,9 @@ _REFINEMENTS = 5
 class EkfSlamOptions(LandmarkSlamOptions, GainOptions):
     """Options of EKF-SLAM."""
 
+    doubt_sightings: Annotated[int, Field(ge=0, le=30)] = 10
+    """With a gate: after so many sightings of known landmarks, four fifths of them rejected, the
+    pose on which those agree replaces the filter's, which a turn unseen by the wheels locks out."""
     errors: Errors = "coordinates"
     """What the covariance describes. `coordinates`: the differences of headings and positions.
     `invariant`: the turn and shift of the whole map about the origin of the map frame, and what is
@@ -67,9 +79,10 @@ class EkfSlam(EkfSlamOptions, TeamEstimator):
     Notes
     -----
     Extras: `associations` (K,): for each observation, counted from 0 over the whole run, the one
-    that started its landmark, itself if it is the first, -1 if it was rejected; with `keep_map`
-    also `landmarks` (N, 3) and `landmark_covariances` (N, 3, 3); `wheel_gains` (3,), g_r, g_l and
-    g_b, where they are states; `status` when an image was not used.
+    that started its landmark, itself if it is the first, -1 if it was rejected, -2 if its landmark
+    has just counted (`repeat_s`); with `keep_map` also `landmarks` (N, 3) and
+    `landmark_covariances` (N, 3, 3); `wheel_gains` (3,), g_r, g_l and g_b, where they are states;
+    `status` when an image was not used.
 
     A step costs O(K N^2): the whole covariance is touched. So the map holds at most 4000 landmarks;
     `status` says when it is full, and when an image has more than 1000 observations.
@@ -112,6 +125,9 @@ class EkfSlam(EkfSlamOptions, TeamEstimator):
                 mean[_own(robot)], P[_own(robot), _own(robot)] = start.mean, start.covariance
         self._state = JointGaussian(mean, P, first + 3 * _MOST_LANDMARKS)
         self._motions = [STILL] * n  # since the last image
+        after = 0 if self.gate_probability is None else self.doubt_sightings
+        self._doubts = [Doubt(after) for _ in range(n)]
+        self._n_trusted = [0] * n  # landmarks when a robot's last sighting of one passed the gate
 
     def step_team(self, frames: Sequence[Frame]) -> list[Belief]:
         """Take in the Frames of one instant; the belief of each of their robots.
@@ -190,6 +206,7 @@ class EkfSlam(EkfSlamOptions, TeamEstimator):
     def _move(self, robot: int) -> None:
         """Apply a robot's motion since its last image to its pose and to its correlations."""
         P, own, motion = self._state.covariance, _own(robot), self._motions[robot]
+        self._doubts[robot].move((self._gained.motion if self._gains else motion).mean)
         if self._gains:
             walked = self.gain_wander_m * self._gained.travel_m
             self._state.mean[own] = self._gained.apply(self._state.mean[own], P, own, self._gains)
@@ -226,6 +243,9 @@ class EkfSlam(EkfSlamOptions, TeamEstimator):
         )
         if self.gate_probability is not None and len(slots):
             passed = self._passed(robot, image, slots)
+            if self._relocate(robot):
+                passed = self._passed(robot, image, slots) & (slots >= 0)
+                extras["status"] = "gate locked out: placed again by its last sightings"
             image, slots = image.select(passed), slots[passed]
         self.front_end.note_counted(image, frame)
         old = slots >= 0
@@ -272,7 +292,42 @@ class EkfSlam(EkfSlamOptions, TeamEstimator):
         predicted, *by = self._predict(robot, self._landmarks[old])
         v, R = self._camera.innovation(predicted, image.points[slots >= 0])
         distances = mahalanobis_squared(v, self._predicted_spread(own, self._rows(old), *by) + R)
-        return self.front_end.passed(image, slots, distances, self._state.mean[own])
+        passed = self.front_end.passed(image, slots, distances, self._state.mean[own])
+        doubt, known = self._doubts[robot], slots >= 0
+        if known.any():
+            in_base = self._camera.place(np.zeros(3), image.points[known])[..., :2]
+            doubt.note(old, in_base, passed[known])
+        if passed[known].any():
+            self._n_trusted[robot] = self._n_landmarks
+        return passed & (known | (not doubt.rises))
+
+    def _relocate(self, robot: int) -> bool:
+        """Where the gate has locked a robot out, put it where its sightings agree that it is.
+
+        What it knew of its pose is forgotten, and so is the place of each landmark that it has
+        added since the last sighting that passed.
+        """
+        pose = self._doubts[robot].resolve(self._landmarks[:, :2])
+        if pose is None:
+            return False
+        P, own = self._state.covariance, _own(robot)
+        if self.invariant:
+            self._shear(1.0)
+        P[own], P[:, own] = 0.0, 0.0
+        P[own, own], self._state.mean[own] = _ENTERS, pose
+        for rows in self._rows(np.arange(self._n_trusted[robot], self._n_landmarks)):
+            P[rows, rows] += _FORGOTTEN_M**2
+        if self.invariant:
+            self._shear(-1.0)
+        self._doubts[robot].clear()
+        return True
+
+    def _shear(self, sign: float) -> None:
+        """Make the covariance of a motion of the whole map that of coordinates, or (-1) back."""
+        P = self._state.covariance
+        arm = sign * _quarter_turned(self._state.mean.reshape(-1, 3)).ravel()
+        P += np.outer(arm, P[2])
+        P += np.outer(P[:, 2], arm)
 
     def _rows(self, slots: Ints) -> Ints:
         """Rows (K, 3) of landmarks in the state."""
@@ -381,7 +436,7 @@ class EkfSlam(EkfSlamOptions, TeamEstimator):
         distances[:, predicted[:, 2] < MIN_DEPTH_M] = np.inf
         if numbers is not None:
             distances[numbers[:, None] != others] = np.inf
-        rows, columns = _matches(distances, self.sighting_d0)
+        rows, columns = pair_nearest(distances, self.sighting_d0)
         if len(rows):
             v, R = sightings.camera.innovation(predicted[columns], points[rows])
             self._update(own, at[columns], of_pose[columns], of_other[columns], v, R)
@@ -429,17 +484,6 @@ class EkfSlam(EkfSlamOptions, TeamEstimator):
 def _own(robot: int) -> slice:
     """Rows of a robot's pose in the state."""
     return slice(3 * robot, 3 * robot + 3)
-
-
-def _matches(distances: Array, d0: float) -> tuple[Ints, Ints]:
-    """Rows and columns of the least distances below d0, each row and column once."""
-    left, rows, columns = distances.copy(), [], []
-    while left.size and left.min() < d0:
-        row, column = np.unravel_index(int(np.argmin(left)), left.shape)
-        rows.append(row)
-        columns.append(column)
-        left[row], left[:, column] = np.inf, np.inf
-    return np.array(rows, np.int64), np.array(columns, np.int64)
 
 
 def _quarter_turned(points: Array) -> Array:

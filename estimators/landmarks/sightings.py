@@ -174,3 +174,14 @@ def pose_by_points(in_base: Array, in_map: Array) -> Array | None:
     heading = np.arctan2(np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]), np.sum(a * b))
     turned = se2.transform(np.array([0.0, 0.0, heading]), centre[None])[0]
     return np.array([*(target - turned), heading])
+
+
+def pair_nearest(distances: Array, d0: float) -> tuple[Ints, Ints]:
+    """Rows and columns of the least distances below d0, each row and column once."""
+    left, rows, columns = distances.copy(), [], []
+    while left.size and left.min() < d0:
+        row, column = np.unravel_index(int(np.argmin(left)), left.shape)
+        rows.append(row)
+        columns.append(column)
+        left[row], left[:, column] = np.inf, np.inf
+    return np.array(rows, np.int64), np.array(columns, np.int64)

@@ -17,7 +17,7 @@ from scipy.special import chdtri  # scipy.stats takes half a second to import
 
 from estimators.base import Prior
 from estimators.landmarks.stereo import NoiseAt, NoiseModel, StereoModel, TeamEyesOptions
-from estimators.wheels import ForwardSlipOptions
+from estimators.wheels import WheelOptions
 from sim.arrays import Array, Floats, Ints
 from sim.errors import require
 from sim.options import NonNegative, Positive, Probability, options
@@ -30,7 +30,7 @@ _BLIND_IMAGES = 100  # images without a landmark after which the status reports 
 
 
 @options("estimator")
-class LandmarkSlamOptions(ForwardSlipOptions, TeamEyesOptions):
+class LandmarkSlamOptions(WheelOptions, TeamEyesOptions):
     """What the filters of landmark SLAM have in common."""
 
     association: Association = "known"
@@ -92,6 +92,8 @@ class Image:
         (A,) which of all the image's observations these are.
     status
         What is wrong with the others; empty if nothing is.
+    again
+        (A,) which of all would count again too soon.
     """
 
     points: Array
@@ -100,6 +102,7 @@ class Image:
     descriptors: Floats
     used: NDArray[np.bool_]
     status: str
+    again: NDArray[np.bool_]
 
     def select(self, kept: NDArray[np.bool_]) -> Image:
         """Return the image with these (K,) of its observations only."""
@@ -107,7 +110,7 @@ class Image:
         used[np.flatnonzero(used)[~kept]] = False
         ids = None if self.ids is None else self.ids[kept]
         parts = self.points[kept], self.numbers[kept], ids, self.descriptors[kept]
-        return Image(*parts, used, self.status)
+        return Image(*parts, used, self.status, self.again)
 
 
 def screen(
@@ -207,11 +210,13 @@ class SlamFrontEnd:
         self._n_observations += len(used)
         ids = None if all_ids is None else all_ids[used]
         points = np.ascontiguousarray(all_points[used])
-        image = Image(points, numbers, ids, seen["descriptors"][used], used, status)
+        again = np.zeros(len(used), bool)
+        image = Image(points, numbers, ids, seen["descriptors"][used], used, status, again)
         if self.believed.repeat_s == 0.0:
             return image
         last = [self._last_s.get((frame.robot, i), -math.inf) for i in _listed(image)]
-        return image.select(frame.stamp - np.array(last) >= self.believed.repeat_s)
+        kept = image.select(frame.stamp - np.array(last) >= self.believed.repeat_s)
+        return dataclasses.replace(kept, again=used & ~kept.used)
 
     def note_counted(self, image: Image, frame: Frame) -> None:
         """Note when the landmarks of a Frame's image counted."""
@@ -279,9 +284,10 @@ class SlamFrontEnd:
     def associations(self, image: Image, landmarks: Ints) -> Ints:
         """For each observation of an image, used or not, the one that started its landmark.
 
-        `landmarks` (K,) are -1 for observations that start one; rejected observations get -1.
+        `landmarks` (K,) are -1 for observations that start one; rejected observations get -1, and
+        those that would count again too soon -2.
         """
-        origins = np.full(len(image.used), -1)
+        origins = np.where(image.again, -2, -1)
         old = landmarks >= 0
         origins[image.used] = image.numbers
         origins[np.flatnonzero(image.used)[old]] = self.origins[landmarks[old]]

@@ -71,7 +71,10 @@ class GtsamBatch(GtsamBatchOptions):
         keys = map(model.pose_key, range(len(guess)))
         poses = np.array([model.planar(solved.atPose3(key)) for key in keys])
         marginals = gtsam.Marginals(graph, solved)
-        means, covariances = self._drive.fill_in(poses, self._joint(marginals, poses))
+        model = self._isam2.model
+        last = marginals.marginalCovariance(model.pose_key(len(poses) - 1))
+        alone = model.covariance(last, poses[-1:, 2])
+        means, covariances = self._drive.fill_in(poses, self._joints(marginals, poses), alone)
         converged = optimizer.iterations() < self.max_iterations
         return Estimate(
             stamps=self._drive.stamps,
@@ -81,16 +84,12 @@ class GtsamBatch(GtsamBatchOptions):
             status="ok" if converged else "not_converged",
         )
 
-    def _joint(self, marginals: Any, poses: Array) -> Array:
-        """Covariance (3 T, 3 T) of the poses; only those of neighbours are filled in."""
+    def _joints(self, marginals: Any, poses: Array) -> Array:
+        """Covariance (T - 1, 6, 6) of each pose with the next."""
         model, n = self._isam2.model, len(poses)
-        joint = np.zeros((3 * n, 3 * n))
-        if n == 1:
-            block = marginals.marginalCovariance(model.pose_key(0))
-            return model.covariance(block, poses[:, 2])
+        joints = np.zeros((n - 1, 6, 6))
         for first, second in itertools.pairwise(range(n)):
             keys = [model.pose_key(first), model.pose_key(second)]
             both = marginals.jointMarginalCovariance(keys).fullMatrix()
-            rows = slice(3 * first, 3 * first + 6)
-            joint[rows, rows] = model.covariance(both, poses[[first, second], 2])
-        return joint
+            joints[first] = model.covariance(both, poses[[first, second], 2])
+        return joints

@@ -16,6 +16,8 @@ from experiments.calibration.reference import (
     INTERVAL_S,
     Reference,
     Source,
+    is_mirrored,
+    mirror,
     names_of,
     reference_of,
     register_scans,
@@ -26,6 +28,7 @@ from experiments.calibration.sensor_noise import MAD, camera_noise, laser_noise
 from experiments.calibration.slip import BLOCK_S, N_RESAMPLES, slip_of_blocks
 from experiments.evaluation.statistics import Interval
 from experiments.runs.calibration import Calibration, SensorBelief, Wheels
+from experiments.runs.evaluate import OnStep
 from sim import se2
 from sim.arrays import Array, Ints
 from sim.errors import require
@@ -86,8 +89,12 @@ class LogCalibration:
         return "\n".join(lines)
 
 
-def calibrate_log(recording: Recording, until_s: float | None = None) -> LogCalibration:
+def calibrate_log(
+    recording: Recording, until_s: float | None = None, on_step: OnStep = None
+) -> LogCalibration:
     """Calibrate a robot by the first `until_s` of a log, or by all of it.
+
+    `on_step` is called with the number of Frames done.
 
     Raises
     ------
@@ -95,7 +102,14 @@ def calibrate_log(recording: Recording, until_s: float | None = None) -> LogCali
         If there is nothing to compare the wheels with, or too little of it.
     """
     part = recording if until_s is None else _cut(recording, until_s)
-    return calibrate_against(reference_of(part), part)
+    mirrored = [name for name in names_of(part, Laser) if is_mirrored(part, name)]
+    part = mirror(part, mirrored)
+    found = calibrate_against(reference_of(part, on_step), part)
+    sensors = dict(found.calibration.sensors)
+    for name in mirrored:
+        sensors[name] = dataclasses.replace(sensors.get(name, SensorBelief()), mirrored=True)
+    calibration = dataclasses.replace(found.calibration, sensors=sensors)
+    return dataclasses.replace(found, calibration=calibration)
 
 
 def calibrate_against(reference: Reference, part: Recording) -> LogCalibration:

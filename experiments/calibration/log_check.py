@@ -4,8 +4,7 @@ import math
 
 import numpy as np
 
-from experiments.calibration.from_log import calibrate_against
-from experiments.calibration.reference import reference_of, wheel_delay_s
+from experiments.calibration.from_log import LogCalibration, calibrate_log
 from sim.arrays import Array
 from sim.errors import InputError
 from sim.recording import Recording
@@ -13,6 +12,7 @@ from sim.recording import Recording
 DELAY_S = 0.05  # a delay of the wheels above this is reported
 GAIN = 0.01  # so is a gain or scale that is this far from 1
 TURN = 0.02  # and a track that is this share off
+SIDEWAYS = 0.25  # share of the way; raw logs have up to 0.06, even of poses seconds apart
 _LONG_GAP = 20.0  # in median steps
 _DECIMALS = (0.001, 0.01, 0.1, 1.0)
 
@@ -20,9 +20,18 @@ _DECIMALS = (0.001, 0.01, 0.1, 1.0)
 def check_log(recording: Recording) -> list[str]:
     """Warnings, a line each; empty if nothing is odd.
 
-    The clocks are checked of every log; wheels and sensors of a log with a truth, scans or
-    landmarks, against which `calibrate_against` compares them.
+    Wheels and sensors are checked of a log with a truth, scans or landmarks, against which
+    `calibrate_log` compares them.
     """
+    try:
+        compared = check_calibration(recording, calibrate_log(recording))
+    except InputError as error:
+        compared = [f"wheels and sensors are not compared: {error}"]
+    return check_clocks(recording) + compared
+
+
+def check_clocks(recording: Recording) -> list[str]:
+    """Warnings about the stamps of a log, its poses, and what it writes where nothing was seen."""
     notes = recording.config.get("notes", {})
     warnings = [
         f"{name.removesuffix(ending).replace('_', ' ')}: {count} readings {what}"
@@ -39,7 +48,13 @@ def check_log(recording: Recording) -> list[str]:
         clocks["truth"] = recording.truth.stamps
     for name, stamps in clocks.items():
         warnings += _clock(name, stamps)
-    return warnings + _motion(recording)
+    share = notes.get("sideways_share", 0.0) if isinstance(notes, dict) else 0.0
+    if isinstance(share, float) and share > SIDEWAYS:
+        warnings.append(
+            f"wheels: {100.0 * share:.0f} % of their way is sideways, which wheels cannot do: its "
+            "poses look corrected by a mapper; give the raw log"
+        )
+    return warnings
 
 
 def _clock(name: str, stamps: Array) -> list[str]:
@@ -68,22 +83,13 @@ def _clock(name: str, stamps: Array) -> list[str]:
     return warnings
 
 
-def _motion(recording: Recording) -> list[str]:
-    """Compare the wheels and the sensors with the best that the log has."""
-    try:
-        reference = reference_of(recording)
-        delay_s = wheel_delay_s(recording.wheels, reference).value
-    except InputError as error:
-        return [f"wheels and sensors are not compared: {error}"]
-    warnings, against = [], f"against the {reference.source}"
-    if abs(delay_s) >= DELAY_S:
-        side = "ahead" if delay_s > 0.0 else "behind"
-        warnings.append(f"wheels: their stamps are {abs(delay_s):.2f} s {side}, {against}")
-    try:
-        found = calibrate_against(reference, recording)
-    except InputError:
-        return warnings
+def check_calibration(recording: Recording, found: LogCalibration) -> list[str]:
+    """Warnings where the wheels and the sensors of a log are not as it has them."""
     wheels, track_m = found.calibration.wheels, recording.robot.track_m
+    warnings, against = [], f"against the {found.source}"
+    if abs(wheels.delay_s) >= DELAY_S:
+        side = "ahead" if wheels.delay_s > 0.0 else "behind"
+        warnings.append(f"wheels: their stamps are {abs(wheels.delay_s):.2f} s {side}, {against}")
     for side, gain in (("right", wheels.gain_right), ("left", wheels.gain_left)):
         if abs(gain - 1.0) > GAIN:
             warnings.append(
@@ -94,6 +100,8 @@ def _motion(recording: Recording) -> list[str]:
             f"wheels: they turn the robot as {wheels.track_m:.3f} m apart do, not {track_m:.3f} m"
         )
     for name, sensor in found.calibration.sensors.items():
+        if sensor.mirrored:
+            warnings.append(f"{name}: its beams run the other way: it is mounted upside down")
         if abs(sensor.scale - 1.0) > GAIN:
             longer = 100.0 * (sensor.scale - 1.0)
             warnings.append(f"{name}: ranges are {longer:+.1f} % off, {against}")

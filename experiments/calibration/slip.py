@@ -6,13 +6,14 @@ import numpy as np
 from scipy import optimize
 
 from experiments.calibration.logs import slip_law
-from experiments.evaluation.statistics import Interval
+from experiments.evaluation.statistics import Interval, share_interval
 from experiments.runs.calibration import Slip
-from sim.arrays import Array, Ints
+from sim.arrays import Array, Bools, Ints
 
 BLOCK_S = 4.0  # over which errors of the wheels are summed: stamps and starts cancel
 N_RESAMPLES = 200
 _MAX_LASTING = 10.0  # blocks; slip that lasts longer is a gain
+_FAILED = 10.0  # robust deviations
 _NO_SLIP_M = 1e-12  # kr or kl that is at its bound of zero
 
 
@@ -21,10 +22,14 @@ def slip_of_blocks(
 ) -> tuple[Slip, dict[str, Interval]]:
     """kr, kl by the turns of blocks, times the track, and the forward slip that they leave.
 
+    Blocks that are off by more than ten robust deviations are left out: there the reference failed.
     Both get what they have in common unless the log tells them apart: blocks in which both wheels
     roll alike say nothing of either, and a kr of zero would be believed. Forward slip lasts if the
     errors of a block and the next are alike.
     """
+    sound = _sound(off_m, path_m) & _sound(forward_m, path_m)
+    outliers = share_interval(int(np.sum(~sound)), len(sound))
+    stamps, off_m, forward_m, path_m = (v[sound] for v in (stamps, off_m, forward_m, path_m))
     travel_m = path_m.mean(axis=1)
     joined = np.append(np.diff(stamps) < 1.5 * BLOCK_S, False)
     product = np.where(joined, forward_m * np.roll(forward_m, -1), 0.0)
@@ -66,7 +71,13 @@ def slip_of_blocks(
     return Slip(**dict(zip(names, map(float, values), strict=True))), {
         f"slip.{name}": Interval(float(v), float(a), float(b))
         for name, v, a, b in zip(names, values, low, high, strict=True)
-    }
+    } | {"wheels: outliers": outliers}
+
+
+def _sound(off_m: Array, path_m: Array) -> Bools:
+    """Which blocks' errors (B,) are not far beyond what most of them are by their travel."""
+    size = np.abs(off_m) / np.sqrt(path_m.sum(axis=1))
+    return np.asarray(size <= _FAILED * 1.4826 * np.median(size) + 1e-12)
 
 
 def lasting_blocks(alike: float) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -44,6 +45,57 @@ def info(
             show(f"check       {warning}")
 
 
+def solve(
+    log: Log,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write.")],
+    relations: Annotated[
+        Path | None,
+        typer.Option(help="Relations to judge the path by; lines of t1 t2 x y z roll pitch yaw."),
+    ] = None,
+    robot: WhichRobot = None,
+    override: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="Override, such as estimator.kr=1e-3; repeat it."),
+    ] = None,
+) -> None:
+    """Find the path and the map of a log: check it, calibrate its robot, run graph SLAM.
+
+    The folder gets page.html, trajectory.tum, map.yaml and .pgm, recording.npz, calibration.yaml,
+    summary.json and summary.csv. Of a log of landmarks with ids the path is EKF-SLAM's. A truth
+    that the log has judges the path alone.
+
+    Examples
+    --------
+      estima solve fr079.log.gz -o fr079
+
+      estima solve fr079.log.gz -o fr079 --relations fr079.relations.gz
+
+      estima solve MRCLAM_Dataset6.tar.xz --robot 3 -o robot3
+    """
+    from experiments.solve import as_text, solve_log
+
+    signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGINT))  # end as by Ctrl-C
+    row = solve_log(log, out, relations, robot, override or ())
+    show(as_text(row, out))
+
+
+@dataclass(frozen=True)
+class KeptPart:
+    """What of a log is converted."""
+
+    truth: Annotated[
+        Path | None,
+        typer.Option(help="Trajectory to take for the truth: .tum, .csv, .mcap, .bag."),
+    ] = None
+    from_s: Annotated[
+        float | None, typer.Option("--from", help="Where it begins, s after the first Frame.")
+    ] = None
+    until_s: Annotated[
+        float | None, typer.Option("--until", help="Where it ends, s after the first Frame.")
+    ] = None
+
+
+@gathered
 def convert(
     log: Log,
     out: Annotated[
@@ -59,6 +111,8 @@ def convert(
     topic: Annotated[
         str | None, typer.Option(help="Of a bag, the nav_msgs/Odometry to convert alone.")
     ] = None,
+    *,
+    kept: KeptPart,
 ) -> None:
     """Convert a log to a recording, or a recording or an estimate to a standard file.
 
@@ -76,15 +130,20 @@ def convert(
 
       estima convert MRCLAM_Dataset6.tar.xz --team -o team.npz
 
+      estima convert run.mcap --truth reference.tum --from 12 --until 300 -o run.npz
+
       estima convert estimate.csv -o estimate.tum
     """
     from experiments.trajectories.convert import convert_log, convert_team
+    from experiments.trajectories.part import WHOLE, Part
 
+    part = Part(kept.truth, kept.from_s, kept.until_s)
     if whole:
         require(robot is None, "--team takes all robots; leave out --robot")
+        require(part == WHOLE, "--truth, --from and --until are for one robot; leave out --team")
         print(convert_team(log, out))
     else:
-        print(convert_log(log, out, robot, topic))
+        print(convert_log(log, out, robot, topic, part))
 
 
 @dataclass(frozen=True)

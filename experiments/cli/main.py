@@ -74,6 +74,7 @@ _COMMANDS: dict[str, Callable[..., None]] = {  # as `estima --help` lists them
     "record": run.record,
     "info": logs.info,
     "convert": logs.convert,
+    "solve": logs.solve,
     "options": look.options,
     "recommend": look.recommend,
     "view": look.view,

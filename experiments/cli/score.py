@@ -68,6 +68,13 @@ def score(
     *,
     matching: Matching,
     made: Origin,
+    relations: Annotated[
+        Path | None,
+        typer.Option(
+            help="True relations between poses (lines of t1 t2 x y z roll pitch yaw): score "
+            "by them too, or alone where the recording has no truth."
+        ),
+    ] = None,
     name: Annotated[str, typer.Option(help="Folder of the rows in results/runs.")] = "score",
     as_json: Annotated[bool, typer.Option("--json", help="Print the rows as JSON.")] = False,
 ) -> None:
@@ -83,18 +90,26 @@ def score(
       estima score run.npz theirs.mcap --topic odometry/filtered --align start --as their_filter
 
       estima score run.npz batch.tum --revised --cpu-seconds 2.5 --name leaderboard
+
+      estima score fr079.npz mine.tum --relations fr079.relations.gz
     """
     from experiments.runs.score import Scoring, as_text, score_files
 
     how = Scoring(**matching.stated(), revised=made.revised, cpu_seconds=made.cpu_seconds)
     results = score_files(
-        recording, trajectories, how, topic=made.topic, estimator=made.estimator, name=name
+        recording,
+        trajectories,
+        how,
+        topic=made.topic,
+        estimator=made.estimator,
+        name=name,
+        relations=relations,
     )
     if as_json:
         print(json.dumps([row for _, row, _ in results], indent=2))
         return
-    for path, _, scored in results:
-        show(f"{path}\n{as_text(scored, how)}")
+    for path, row, scored in results:
+        show(f"{path}\n{as_text(row, scored, how)}")
     print(f"rows: estima table {name}")
 
 

@@ -19,7 +19,25 @@ CHI2_95_2DOF = 5.991464547107979  # 95 % quantile of chi-square with two degrees
 _SINGULAR = 1e-10  # least eigenvalue of a correlation matrix that can be trusted
 RPE_DISTANCES_M = (1.0, 10.0)
 LONGEST_GAP_S = 0.25  # of the truth, over which it is interpolated
-SCORED_EXTRAS = ("dispersion_m",)  # Belief extras that `score` reads, of estimators that have them
+# Belief extras that `score` reads, of estimators that have them
+SCORED_EXTRAS = ("dispersion_m", "registration_status", "associations")
+_USED = ("first", "ok", "degenerate")  # registration statuses
+_AGAIN = -2  # of associations: the landmark had just counted
+
+
+def unused_share(estimate: Estimate) -> float | None:
+    """Share of the scans that were not registered or gated, and of the sightings rejected.
+
+    None for a method that does not say.
+    """
+    extras = estimate.extras
+    scans = [s for s in extras.get("registration_status", ()) if s is not None]
+    images = [np.asarray(a) for a in extras.get("associations", ()) if a is not None]
+    used = np.array([status in _USED for status in scans], bool)
+    if not scans and images:
+        seen = np.concatenate(images)
+        used = seen[seen != _AGAIN] >= 0
+    return 1.0 - float(used.mean()) if len(used) else None
 
 
 def longest_pause_s(stamps: Array, start: float, end: float) -> float:
@@ -167,6 +185,8 @@ def score(
     dispersions = [v for v in estimate.extras.get("dispersion_m", ()) if v is not None]
     if dispersions:
         row["dispersion_final_m"] = float(dispersions[-1])
+    if (unused := unused_share(estimate)) is not None:
+        row["unused_share"] = unused
     if recording.truth is None:
         return row
     truth = recording.truth_at(estimate.stamps, longest_gap_s)
@@ -210,6 +230,7 @@ def path_scores(truth: Array, means: Array, covariances: Array) -> dict[str, flo
         row["ellipse_area_final_m2"] = float(ellipse_area_m2(covariances[-1:])[0])
     if counted.any():
         row["nees_mean"] = float(np.mean(values[counted]))
+        row["nees_median"] = float(np.median(values[counted]))
         row |= {
             f"inside_{percent}_share": float(np.mean(values[counted] <= most))
             for percent, most in _CHI2_3DOF.items()

@@ -14,8 +14,11 @@ from sim import se2
 from sim.arrays import Array
 from sim.errors import require
 from sim.formats.relations import Relations
+from sim.recording import Recording
 
 Association = Literal["near", "interpolated"]
+
+TOLERANCE_S = 0.05  # between the stamp of a relation and that of a pose
 
 
 @dataclass(frozen=True)
@@ -48,12 +51,51 @@ class RelationErrors:
         return found
 
 
+def judged_relations(
+    relations: Relations, *known_stamps: Array, tolerance_s: float = TOLERANCE_S
+) -> Relations:
+    """Relations between two different ones of each of these stamps (T,), s, or near them."""
+    kept = np.ones(len(relations.stamps), dtype=bool)
+    for known in known_stamps:
+        rows = nearest_rows(known, relations.stamps)
+        near = np.abs(known[rows] - relations.stamps) <= tolerance_s
+        kept &= near.all(axis=1) & (rows[:, 0] != rows[:, 1])
+    return Relations(relations.stamps[kept], relations.motion[kept])
+
+
+def relation_scores(
+    recording: Recording, relations: Relations, stamps: Array, poses: Array
+) -> dict[str, float]:
+    """Mean errors of poses (T, 3) at stamps (T,) by a log's relations, as columns of a row.
+
+    Poses at scans count where there are such; of a log that was thinned, only those at scans whose
+    stamps are known.
+    """
+    log, known = recording.logs.get("laser"), recording.config.get("stamps_known")
+    at_scans = np.isin(stamps, [] if log is None else log.stamps)
+    if at_scans.sum() >= 2:  # what lies between them may be guessed by wheels that were rebuilt
+        stamps, poses = stamps[at_scans], poses[at_scans]
+    if log is not None and known is not None:
+        rows = np.array(known, np.int64)
+        require(
+            rows.ndim == 1 and len(rows) and rows.min() >= 0 and rows.max() < len(log.stamps),
+            "stamps_known of the recording must be rows of its scans",
+        )
+        relations = judged_relations(relations, log.stamps[rows])
+    found = relation_errors(relations, stamps, poses).summary()
+    return {
+        "n_relations": found["n_relations"],
+        "relation_translation_m": found["translation_mean_m"],
+        "relation_rotation_rad": found["rotation_mean_rad"],
+    }
+
+
 def relation_errors(
     relations: Relations,
     stamps: Array,
     poses: Array,
     association: Association = "near",
-    tolerance_s: float = 0.05,
+    tolerance_s: float = TOLERANCE_S,
 ) -> RelationErrors:
     """Judge poses (T, 3) at increasing stamps (T,) by relations.
 

@@ -1,7 +1,7 @@
 """A real robot's calibration: the YAML file of `estima calibrate LOG`, and its use."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -15,11 +15,14 @@ from sim.formats.assemble import frame_stamps
 from sim.options import NonNegative, Positive, build, options
 from sim.recording import Log, Recording, WheelLog
 from sim.robot.drive import RobotGeometry
-from sim.sensors import Laser, RobotCamera, StereoCamera
+from sim.sensors import Laser, Mount, RobotCamera, StereoCamera
 from sim.sensors.base import Sensor
 from sim.yaml_file import read_yaml
 
 Delay = Annotated[float, Field(gt=-60.0, lt=60.0), "a number of seconds below a minute"]
+
+
+BELIEVED = ("kr", "kl", "forward_slip_m")  # options of estimators
 
 
 @options("wheels")
@@ -57,6 +60,8 @@ class SensorBelief:
     """Of its mount on the robot."""
     y_m: float | None = None
     yaw_rad: float | None = None
+    mirrored: bool | None = None
+    """Whether a laser is mounted upside down, so that its beams run the other way."""
     scale: Positive = 1.0
     """Logged range over true range."""
     delay_s: Delay = 0.0
@@ -122,7 +127,10 @@ def _believed(name: str, sensor: Sensor, belief: SensorBelief) -> Sensor:
     sigmas = {key: value for key, value in stated.items() if key.startswith("sigma")}
     strange = ", ".join(sigmas.keys() - {f.name for f in dataclasses.fields(sensor)})  # type: ignore[arg-type]
     require(not strange, f"calibration: {name}, a {type(sensor).__name__}, has no {strange}")
-    mounted = dataclasses.replace(sensor.mount, **mount)  # type: ignore[attr-defined]
+    logged: Mount = sensor.mount  # type: ignore[attr-defined]
+    if belief.mirrored:
+        mount = {"yaw_rad": -logged.yaw_rad, **mount}
+    mounted = dataclasses.replace(logged, **mount)
     changed: Sensor = dataclasses.replace(sensor, mount=mounted, **sigmas)  # type: ignore[type-var]
     return changed
 
@@ -138,7 +146,33 @@ def _corrected(log: Log, belief: SensorBelief) -> Log:
     for name in ("ranges_m", "points_in_camera"):
         if name in values:
             values[name] = (values[name] / belief.scale).astype(values[name].dtype)
+    if belief.mirrored and "ranges_m" in values:
+        values["ranges_m"] = values["ranges_m"][:, ::-1].copy()
     return dataclasses.replace(log, stamps=log.stamps + belief.delay_s, values=values)
+
+
+def read_calibrations(given: Any) -> list[Calibration]:
+    """Read what the key `calibration` names: nothing, a file, or a list of one a robot of a team.
+
+    Raises
+    ------
+    InputError
+        As `read_calibration`, or if it is something else.
+    """
+    files = given if isinstance(given, Sequence) and not isinstance(given, str) else [given]
+    require(
+        all(isinstance(file, str) and file for file in files) or given is None,
+        f"calibration must be a path, a list of one path a robot of a team, or null, got {given!r}",
+    )
+    return [] if given is None else [read_calibration(Path(file)) for file in files]
+
+
+def mean_slip(calibrations: Sequence[Calibration]) -> dict[str, float]:
+    """What an estimator can believe of the slip: one law for all robots, the mean of theirs."""
+    return {
+        key: sum(getattr(each.slip, key) for each in calibrations) / len(calibrations)
+        for key in BELIEVED
+    }
 
 
 def read_calibration(path: Path) -> Calibration:

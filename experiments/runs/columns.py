@@ -58,6 +58,10 @@ OF_THE_RUN = {
         "longest time without a pose", "gap", "s", "linear", average=Average.PLAIN
     ),
     "dispersion_final_m": Column("final dispersion of the particles", "dispersion", "m"),
+    "unused_share": Column(
+        "share of scans or sightings not used", "unused", "", "linear", average=Average.PLAIN
+    ),
+    "n_relations": Column("relations", "relations", "", "linear", None, Average.PLAIN),
     "worst_robot_rmse_m": Column("position RMSE of a team's worst robot", "worst robot", "m"),
     "n_sightings": Column("sightings of robots", "sightings", "", "linear", None, Average.PLAIN),
 }
@@ -96,6 +100,11 @@ _OF_THE_PATH = {
     "nees_mean": Column(
         "mean NEES (3 when consistent)", "NEES", better=None, average=Average.PLAIN
     ),
+    "nees_median": Column(
+        "median NEES (2.37 when consistent)", "NEES median", better=None, average=Average.PLAIN
+    ),
+    "relation_translation_m": Column("mean translation error of relations", "relations", "m"),
+    "relation_rotation_rad": Column("mean rotation error of relations", "rotations", "rad"),
     **{
         f"inside_{percent}_share": Column(
             f"share of poses inside the {percent} % ellipsoid",

@@ -20,7 +20,7 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import InterpolationKeyError, OmegaConfBaseException
 
 from experiments.runs import paths
-from experiments.runs.calibration import read_calibration
+from experiments.runs.calibration import mean_slip, read_calibrations
 from experiments.runs.console import TRUSTING
 from experiments.runs.key import digest_of
 from experiments.runs.schema import (
@@ -302,20 +302,20 @@ def set_value(cfg: DictConfig, key: str, value: Any) -> None:
 
 def _believe(cfg: DictConfig) -> None:
     """Put the slip of a calibration in the place of a simulated robot's."""
-    path = cfg.get("calibration")
-    if path is None:
+    given = cfg.get("calibration")
+    if given is None:
         return
-    require(isinstance(path, str) and path, f"calibration must be a path or null, got {path!r}")
+    given = OmegaConf.to_object(given) if isinstance(given, ListConfig) else given
+    slip = mean_slip(read_calibrations(given))
     require(
         cfg.get("recording") is not None,
         "calibration belongs to a real log: set recording too, made by `estima convert LOG -o "
         "FILE.npz`",
     )
-    slip = read_calibration(Path(path)).slip
     for key in ("kr", "kl"):
-        OmegaConf.update(cfg, f"robot.{key}", getattr(slip, key))
+        OmegaConf.update(cfg, f"robot.{key}", slip[key])
     if cfg.estimator.get("forward_slip_m") == 0.0:
-        OmegaConf.update(cfg, "estimator.forward_slip_m", slip.forward_slip_m)
+        OmegaConf.update(cfg, "estimator.forward_slip_m", slip["forward_slip_m"])
 
 
 def searched(config_dir: str | Path | None) -> list[str]:

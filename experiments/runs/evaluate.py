@@ -28,6 +28,7 @@ from experiments.evaluation.metrics import (
     SCORED_EXTRAS,
     longest_pause_s,
     score,
+    unused_share,
 )
 from experiments.evaluation.recording_bound import bound_recording, bound_scores
 from experiments.runs.columns import OF_THE_RUN, REVISED, Average, average_of
@@ -46,6 +47,7 @@ from sim.team import Team
 _ADDED = ("stamps_scored", "stamps_left_out", "step_time_us")  # over the robots
 _STREAMS = 100  # of a run's filters
 REMARKED_PAUSE_S = 1.0  # without a pose
+WARNED_SHARE = 0.1  # of scans or sightings that were not used
 _SPARSE = 5.0  # times the longest step of the recording: a path that chooses its poses
 
 Streams = Callable[[int], np.random.Generator]
@@ -200,9 +202,12 @@ def run_over(
     BLAS uses one thread, or as many as ESTIMA_BLAS_THREADS says: its threads spin while they wait,
     and the matrices of filters are small.
     """
+    n_frames = len(recording.frame_stamps)
     with limit_blas():
         return run_and_finish(
-            estimator, lambda: run(estimator, recording, prior, rng, keep, on_step)
+            estimator,
+            lambda: run(estimator, recording, prior, rng, keep, on_step),
+            None if on_step is None else lambda: on_step(n_frames),
         )
 
 
@@ -264,7 +269,9 @@ def status_of(recording: Recording, online: Estimate, revised: Estimate | None =
     worst = max(pauses, key=lambda status: status.code)
     if online.status == "ok":
         return worst
-    detail = "; ".join(filter(None, [worst.detail, online.status]))
+    unused = unused_share(online) or 0.0
+    said = f"{100.0 * unused:.0f} % of scans or sightings not used" if unused > WARNED_SHARE else ""
+    detail = "; ".join(filter(None, [worst.detail, online.status, said]))
     return Status(Outcome.REMARK, worst.code or "estimator", detail)
 
 

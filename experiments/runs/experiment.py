@@ -17,6 +17,7 @@ from estimators.base import Estimator
 from estimators.programs.host import Isolated
 from estimators.programs.places import needs_of
 from experiments.runs import paths
+from experiments.runs.calibration import BELIEVED
 from experiments.runs.compose import open_composer
 from experiments.runs.key import origin_columns, run_key
 from experiments.runs.objects import OF_TEAMS, Objects, is_grid_file
@@ -132,6 +133,12 @@ class Experiment(Objects):
         """The kr and kl that the estimator believes, m; None if it has no such options."""
         kr, kl = self.option("kr"), self.option("kl")
         return None if kr is None or kl is None else (kr, kl)
+
+    @property
+    def not_believed(self) -> list[str]:
+        """Numbers of the calibration that the estimator has no use for."""
+        unused = [key for key in BELIEVED if key not in self.options_of("estimator")]
+        return unused if self.config["calibration"] is not None else []
 
     @property
     def repeats(self) -> int:
@@ -299,8 +306,7 @@ class Experiment(Objects):
             "prior.start=global: the start of robot 0 must be known to a team; those of the "
             "others may be unknown (team.starts)",
         )
-        for key in ("keep", "calibration"):
-            require(not self.config[key], f"{key} applies to one robot; leave it out for a team")
+        require(not self.config["keep"], "keep applies to one robot; leave it out for a team")
 
     def _check_sensors(self, who: str, needs: Iterable[str], settings: Config) -> None:
         """Check that the robot has the sensors that an estimator needs."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import functools
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,7 +17,7 @@ from estimators.base import Estimator, Prior, TeamEstimator
 from estimators.programs.host import Isolated
 from experiments.evaluation.metrics import SCORED_EXTRAS
 from experiments.runs.cache import fetch_or_make
-from experiments.runs.calibration import read_calibration
+from experiments.runs.calibration import read_calibrations
 from experiments.runs.console import warn
 from experiments.runs.dependencies.recorder import Digests, note_unloaded, recorded
 from experiments.runs.key import recording_key
@@ -32,13 +33,14 @@ from experiments.runs.seeds import stream
 from experiments.runs.targets import make
 from sim.arrays import Array
 from sim.errors import InputError, blaming, require, required
+from sim.formats.detect import read_all
 from sim.options import build
 from sim.people.walk import People
 from sim.recording import Frame, Recording
 from sim.robot.base import RobotGeometry, robot_from_config
 from sim.sensors import Sensor, Sensors, sensors_from_config
 from sim.sensors.base import RecordedSensor, sensor_settings
-from sim.team import Team, load
+from sim.team import Team
 from sim.worlds import grid_file
 from sim.worlds.world import World
 
@@ -203,7 +205,7 @@ class Objects:
                 f"recording: {wanted['_target_']} must return a Recording, "
                 f"got {type(made).__name__}",
             )
-            return Team((self._calibrated(made),))
+            return self._calibrated(Team((made,)))
         if wanted is not None:
             return self._loaded(Path(wanted))
 
@@ -238,16 +240,16 @@ class Objects:
 
     def _loaded(self, path: Path) -> Team:
         """The robots of a file, as they are believed to be."""
-        team = load(path)
+        team = read_all([path])
         if self.team is not None:
             require(self.size <= len(team), f"{path}: a team of {len(team)} robots; set team.size")
-            return team if self.size == len(team) else team.first(self.size)
+            return self._calibrated(team if self.size == len(team) else team.first(self.size))
         try:
             recording = team.only
         except InputError as error:
             raise InputError(f"{path}: {error}") from error
         self._compare_slip(recording)
-        return Team((self._calibrated(self._with_classes(recording)),))
+        return self._calibrated(Team((self._with_classes(recording),)))
 
     def check_size(self, team: Team) -> None:
         """Check that there is a recording for each robot of the experiment.
@@ -285,10 +287,18 @@ class Objects:
         )
         return estimator
 
-    def _calibrated(self, recording: Recording) -> Recording:
-        """Return the recording as the calibration has it."""
-        path = self.config["calibration"]
-        return recording if path is None else read_calibration(Path(path)).apply_to(recording)
+    def _calibrated(self, team: Team) -> Team:
+        """Return the recordings as the calibration has them: each by its own, or all by one."""
+        found = read_calibrations(self.config["calibration"])
+        if not found:
+            return team
+        require(
+            len(found) in (1, len(team)),
+            f"calibration: {len(found)} files for a team of {len(team)}; give one, or one a robot",
+        )
+        own = found * len(team) if len(found) == 1 else found
+        moved = [each.apply_to(robot) for each, robot in zip(own, team.robots, strict=True)]
+        return Team.on_one_clock(moved)
 
     def _with_classes(self, recording: Recording) -> Recording:
         """Return the recording with the classes of its sensors that the configuration names too."""
@@ -369,8 +379,9 @@ def _true_start(recording: Recording) -> Array:
     require(
         bool(np.isfinite(start).all()),
         f"the first Frame is at {begin_s:.2f} s, and the truth spans {spans[0]:.2f} to "
-        f"{spans[1]:.2f} s: no start pose is known; cut the recording to the time of its truth, "
-        "or set prior.start=global",
+        f"{spans[1]:.2f} s: no start pose is known; have `estima convert` cut the log from "
+        f"{math.ceil(max(float(spans[0]) - begin_s, 0.0) * 100) / 100:.2f} s on, or set "
+        "prior.start=global",
     )
     return start
 

@@ -67,6 +67,11 @@ def run_once(experiment: Experiment, draw: Draw, out: Path | None = None) -> lis
                 "geometry that the log's reader assumes; to find its own: "
                 "estima calibrate LOG -o cal.yaml, then calibration=cal.yaml"
             )
+        if unused := experiment.not_believed:
+            show(
+                f"{name} has no use for the calibration's {', '.join(unused)}; it takes the "
+                "wheels, mounts and noise of sensors from it"
+            )
         return read
 
     def keep(recording: Recording, repeat: int, online: Estimate, revised: Estimate | None) -> None:

@@ -23,6 +23,7 @@ from experiments.evaluation.metrics import (
     relative_errors,
     rms,
 )
+from experiments.evaluation.relations import relation_scores
 from experiments.evaluation.time_sync import Rows, nearest_rows
 from experiments.runs.columns import OF_THE_RUN, REVISED
 from experiments.runs.evaluate import status_of_pauses
@@ -36,6 +37,7 @@ from sim import se2
 from sim.arrays import Array
 from sim.errors import InputError, require
 from sim.formats.detect import read_any
+from sim.formats.relations import read_relations
 from sim.options import NonNegative, options
 from sim.recording import Recording
 
@@ -96,7 +98,11 @@ def match_and_align(recording: Recording, given: Estimate, how: Scoring) -> Scor
     InputError
         If the recording has no truth, or fewer than three poses meet it.
     """
-    require(recording.truth is not None, "this recording has no truth to score against")
+    require(
+        recording.truth is not None,
+        "this recording has no truth to score against; give it one with `estima convert`, or "
+        "relations",
+    )
     stamps = given.stamps + how.offset_s
     rows: Rows
     if how.match == "nearest":
@@ -166,18 +172,20 @@ def error_table(scored: ScoredTrajectory) -> dict[str, dict[str, float]]:
 
 def row_of(
     recording: Recording,
-    scored: ScoredTrajectory,
+    given: Estimate,
+    scored: ScoredTrajectory | None,
     how: Scoring,
     *,
     files: tuple[Path, Path],
     estimator: str,
     name: str,
-    repeat: int = 0,
 ) -> Row:
     """Return the row of a trajectory, as a run over the recording from its file has one.
 
     Parameters
     ----------
+    given, scored
+        The trajectory, and beside the truth; None of a recording without one.
     files
         Of the recording and of the trajectory.
     estimator, name
@@ -187,9 +195,10 @@ def row_of(
     del settings["trajectory.cpu_seconds"]
     checksum = recording.checksum
     origin = json.dumps([checksum, _digests_of(files[1]), settings, estimator])
-    status, seed = status_of_pauses(recording, scored.estimate.stamps), recording.config.get("seed")
-    if status.outcome is Outcome.OK and scored.estimate.left_out:
-        status = Status(Outcome.REMARK, "planar", scored.estimate.left_out)
+    stamps = given.stamps + how.offset_s if scored is None else scored.estimate.stamps
+    status, seed = status_of_pauses(recording, stamps), recording.config.get("seed")
+    if status.outcome is Outcome.OK and given.left_out:
+        status = Status(Outcome.REMARK, "planar", given.left_out)
     row: Row = {
         "choice.estimator": estimator,
         "seed": seed if type(seed) is int else 0,
@@ -198,21 +207,28 @@ def row_of(
         "name": name,
         "trajectory.file": str(files[1]),
         **settings,
-        "repeat": repeat,
+        "repeat": 0,
         "run_key": hashlib.sha256(origin.encode()).hexdigest()[:16],
         "code_version": code_version(),
         "recording_checksum": checksum,
         **status.columns(),
-        "duration_s": float(np.ptp(scored.estimate.stamps)),
+        "duration_s": float(np.ptp(stamps)),
+    }
+    if how.cpu_seconds is not None:
+        row["cpu_time_us"] = 1e6 * how.cpu_seconds / len(given.stamps)
+    if scored is None:
+        return row
+    row |= {
         "stamps_scored": float(len(scored.truth)),
         "stamps_left_out": float(scored.n_left_out),
         "longest_gap_s": scored.longest_gap_s,
     }
-    if how.cpu_seconds is not None:
-        row["cpu_time_us"] = 1e6 * how.cpu_seconds / scored.n_given
     scores = path_scores(scored.truth, scored.estimate.means, scored.estimate.covariances)
-    prefix = REVISED if how.revised else ""
-    return row | {k if k in OF_THE_RUN else f"{prefix}{k}": v for k, v in scores.items()}
+    return row | {f"{_prefix(how, key)}{key}": value for key, value in scores.items()}
+
+
+def _prefix(how: Scoring, key: str) -> str:
+    return REVISED if how.revised and key not in OF_THE_RUN else ""
 
 
 def score_files(
@@ -223,7 +239,8 @@ def score_files(
     topic: str | None = None,
     estimator: str | None = None,
     name: str = "score",
-) -> list[tuple[Path, Row, ScoredTrajectory]]:
+    relations: Path | None = None,
+) -> list[tuple[Path, Row, ScoredTrajectory | None]]:
     """Score trajectories of a recording's file, and write their rows to results/runs/NAME.
 
     Parameters
@@ -232,6 +249,9 @@ def score_files(
         Of trajectories in bags.
     estimator
         What made the trajectory; None: each is called by its file.
+    relations
+        File of true relations between poses, to score by too; a recording without a truth has
+        them alone.
     """
     folder = rows_folder(name)
     alone = len(trajectories) == 1 or (estimator is None and how.cpu_seconds is None)
@@ -242,27 +262,44 @@ def score_files(
         f"two trajectories called {max(names, key=names.count)}; score and name them one by one",
     )
     recording, results = read_any([path]), []
+    judged = None if relations is None else read_relations(relations)
     for trajectory, called in zip(trajectories, names, strict=True):
         given = read_trajectory(trajectory, topic)
         try:
-            scored = match_and_align(recording, given, how)
+            alone = recording.truth is None and judged is not None
+            scored = None if alone else match_and_align(recording, given, how)
+            files = (path, trajectory)
+            row = row_of(recording, given, scored, how, files=files, estimator=called, name=name)
+            if judged is not None:
+                stamps = given.stamps + how.offset_s
+                found = relation_scores(recording, judged, stamps, given.means)
+                row |= {f"{_prefix(how, key)}{key}": value for key, value in found.items()}
         except InputError as error:
             raise InputError(f"{trajectory}: {error}") from error
-        row = row_of(recording, scored, how, files=(path, trajectory), estimator=called, name=name)
         results.append((trajectory, row, scored))
     for _, row, _ in results:
         write_run([row], folder)
     return results
 
 
-def as_text(scored: ScoredTrajectory, how: Scoring) -> str:
+def as_text(row: Row, scored: ScoredTrajectory | None, how: Scoring) -> str:
     """Say what was scored, and the statistics of its errors."""
+    by_relations = []
+    if "n_relations" in row:
+        metres, angle = (
+            row[f"{_prefix(how, key)}{key}"]
+            for key in ("relation_translation_m", "relation_rotation_rad")
+        )
+        said = f"  {row['n_relations']:.0f} relations: {metres:.6g} m, {angle:.6g} rad in the mean"
+        by_relations.append(said)
+    if scored is None:
+        return "\n".join(by_relations)
     errors = error_table(scored)
     heads = list(next(iter(errors.values())))
     lines = [f"  {'':<24}" + "".join(f"{head:>19}" for head in heads)]
     for error, values in errors.items():
         lines.append(f"  {error:<24}" + "".join(f"{values[head]:>19.12g}" for head in heads))
-    return "\n".join([describe_scoring(scored, how), *lines])
+    return "\n".join([describe_scoring(scored, how), *lines, *by_relations])
 
 
 def describe_scoring(scored: ScoredTrajectory, how: Scoring) -> str:

@@ -12,6 +12,7 @@ from experiments.trajectories.odometry import (
     write_odometry_csv,
     write_odometry_json,
 )
+from experiments.trajectories.part import WHOLE, Part
 from experiments.trajectories.read import read_trajectory
 from sim.errors import InputError, require, required
 from sim.formats.detect import kind_of, read_any
@@ -126,7 +127,11 @@ def _slip(recording: Recording) -> tuple[float, float] | None:
 
 
 def convert_log(
-    log: Sequence[Path], out: Path, robot: int | None = None, topic: str | None = None
+    log: Sequence[Path],
+    out: Path,
+    robot: int | None = None,
+    topic: str | None = None,
+    part: Part = WHOLE,
 ) -> str:
     """Convert a log, or an estimate, to the file that its new name says; say what was written.
 
@@ -136,15 +141,18 @@ def convert_log(
         Which robot of a log of several.
     topic
         Of a bag, the odometry to convert alone.
+    part
+        Of a log.
     """
     _check_output(log, out)
     if topic is not None or is_estimate(log):
         require(len(log) == 1, f"{log[0]}: an estimate is one file, got {len(log)}")
+        require(part == WHOLE, f"{log[0]}: a truth and a part are for logs, not for estimates")
         estimate = read_trajectory(log[0], topic)
         write_estimate(out, estimate)
         seconds = estimate.stamps[-1] - estimate.stamps[0]
         return f"{out}: {len(estimate.stamps)} poses, {seconds:.1f} s"
-    recording = read_any(log, robot)
+    recording = part.of(read_any(log, robot))
     write_recording(out, recording)
     said = f"{out}: {recording.duration_s:.1f} s, {len(recording.frame_stamps)} frames"
     dropped = ", ".join(name for name in recording.logs if name != "laser")

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from sim import se2
-from sim.arrays import Array, Floats, Ints
+from sim.arrays import Array, ArrayLike, Floats, Ints
 from sim.errors import InputError, require
 from sim.recording import Log, Recording, Truth, WheelLog
 from sim.robot.arc import arc_increment
@@ -32,6 +32,10 @@ Notes = dict[str, Any]
 
 LONGEST_HOLD_S = 1.5
 LONGEST_FRAME_S = 0.2
+# What stands for nothing seen: so many readings at least, this share of all, and so many times
+# those of any value around it; codes lie this near one another (SICK: 81.83 to 81.91 m)
+_FEWEST_SPIKED, _SHARE_SPIKED, _SPIKE = 20, 5e-4, 5.0
+_CODES, _AROUND, _LEAST_SPIKE_MM = 0.0015, 0.05, 2000.0
 
 
 def in_order(stamps: Array, name: str, notes: Notes) -> Rows:
@@ -183,9 +187,61 @@ def scanner(
     )
 
 
-def seen_ranges(raw_m: Array, max_range_m: float) -> Floats:
-    """Ranges with +inf where nothing was seen: at or beyond the maximum, zero, or not a number."""
-    return np.where((raw_m > 0.0) & (raw_m < max_range_m), raw_m, np.inf).astype(np.float32)
+def seen_ranges(raw_m: Array, max_range_m: float, notes: Notes) -> tuple[Floats, float]:
+    """Ranges with +inf where nothing was seen, and the greatest range that the sensor measures.
+
+    Nothing was seen at zero or less, at what is not a number, at the maximum or beyond, and at
+    what the sensor writes instead: a value of which the log holds far more than of those around it.
+
+    Parameters
+    ----------
+    raw_m
+        (M, n) m, as logged.
+    max_range_m
+        By the format or the log's header.
+    notes
+        Takes `no_return`: what was written for nothing seen, and the share of the beams.
+    """
+    written = {"zero or less": raw_m <= 0.0, "NaN": np.isnan(raw_m), "inf": np.isposinf(raw_m)}
+    raw_m = np.where(np.isfinite(raw_m) & (raw_m > 0.0), raw_m, np.inf)
+    for spike_m, beyond in _spikes(raw_m):
+        near = raw_m >= (1.0 - _CODES) * spike_m if beyond else _in_mm(raw_m) == _in_mm(spike_m)
+        written[f"{spike_m:g} m{' and beyond' if beyond else ''}"] = near
+        raw_m = np.where(near, np.inf, raw_m)
+        max_range_m = min(max_range_m, spike_m) if beyond else max_range_m
+    beyond_all = np.isfinite(raw_m) & (raw_m >= max_range_m)
+    written.setdefault(f"{max_range_m:g} m and beyond", beyond_all)
+    shares = ((name, 100.0 * float(np.mean(rows))) for name, rows in written.items() if rows.any())
+    if said := ", ".join(f"{name} ({share:.2g} % of beams)" for name, share in shares):
+        notes["no_return"] = said
+    return np.where(raw_m < max_range_m, raw_m, np.inf).astype(np.float32), max_range_m
+
+
+def _in_mm(range_m: ArrayLike) -> Array:
+    return np.round(1e3 * np.asarray(range_m))
+
+
+def _spikes(ranges_m: Array) -> list[tuple[float, bool]]:
+    """Values, m, greatest first, that ranges (M, n) have far too often; and if all beyond count.
+
+    A wall is spread over neighbouring values by noise, and seen by few beams for long; what
+    stands for nothing seen is one value, or a few codes next to each other. If next to nothing
+    lies beyond it, it is the sensor's maximum; else it must come from many beams.
+    """
+    in_mm, found = _in_mm(ranges_m), []
+    values, counts = np.unique(in_mm[np.isfinite(in_mm)], return_counts=True)
+    often = counts >= max(_FEWEST_SPIKED, _SHARE_SPIKED * counts.sum())
+    for i in np.flatnonzero(often & (values >= _LEAST_SPIKE_MM))[::-1].tolist():
+        off = np.abs(values / values[i] - 1.0)
+        around = counts[(off > _CODES) & (off < _AROUND)].max(initial=0)
+        if counts[i] < max(_SPIKE * around, 1):
+            continue
+        n_beams, n_spiked = in_mm.shape[1], int(np.sum((in_mm == values[i]).any(axis=0)))
+        beyond = counts[values > (1.0 + _CODES) * values[i]].sum() <= 0.1 * counts[i]
+        if n_spiked >= min(n_beams, 3) and (beyond or n_spiked >= n_beams / 8):
+            found.append((float(values[i]) / 1e3, bool(beyond)))
+            counts = np.where((off <= _CODES) | (beyond & (values > values[i])), 0, counts)
+    return found
 
 
 def scan_recording(
@@ -198,7 +254,9 @@ def scan_recording(
     config: Notes,
 ) -> Recording:
     """A Recording of wheels and one laser; of its ranges, `seen_ranges` are kept."""
-    ranges = seen_ranges(ranges_m, laser.max_range_m)
+    notes = config.setdefault("notes", {})
+    ranges, max_range_m = seen_ranges(ranges_m, laser.max_range_m, notes)
+    laser = dataclasses.replace(laser, max_range_m=max_range_m)
     return Recording(
         frame_stamps=frame_stamps(wheels.stamps, [scan_stamps]),
         wheels=wheels,

@@ -1,5 +1,6 @@
 """Which format a file is in, and a Recording of it, whatever it is."""
 
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -7,7 +8,7 @@ from pathlib import Path
 from sim.errors import InputError, naming, require
 from sim.files import read_head
 from sim.formats import carmen, khepera
-from sim.formats.intel import read_intel
+from sim.formats.intel import N_THINNED_BEAMS, read_intel, read_thinned_intel
 from sim.formats.lego import read_lego
 from sim.formats.mrclam import read_mrclam
 from sim.formats.rawseeds import read_rawseeds
@@ -36,7 +37,7 @@ class LogFormat:
     has_name
         Whether a name belongs to a file of its folders and archives.
     has_text
-        Whether a text has this format, by its beginning, and that as lines without comments.
+        Whether a text has this format, by all of it, and its first lines without comments.
     n_files
         Least and greatest number of files that a log comes in.
     """
@@ -62,7 +63,7 @@ def _first_words(lines: Sequence[bytes]) -> set[bytes]:
     return {line.split()[0] for line in lines[:200]}
 
 
-_CARMEN = {b"FLASER", b"ROBOTLASER1", b"ODOM", b"VERTEX2"}
+_CARMEN = re.compile(rb"^[ \t]*(FLASER|ROBOTLASER1|ODOM|VERTEX2)\s", re.MULTILINE)
 # In the order in which they are tried
 FORMATS = (
     LogFormat(
@@ -79,7 +80,7 @@ FORMATS = (
     LogFormat(
         "carmen",
         lambda path: carmen.to_recording(carmen.read_carmen(path)),
-        has_text=lambda _, lines: bool(_first_words(lines) & _CARMEN),
+        has_text=lambda data, _: _CARMEN.search(data) is not None,
     ),
     LogFormat(
         "wean",
@@ -96,13 +97,19 @@ FORMATS = (
         "khepera",
         _read_khepera,
         has_name=lambda name: name.endswith(".tuple"),
-        has_text=lambda head, _: b'"sm"' in head and b'"phi_l"' in head,
+        has_text=lambda data, _: b'"sm"' in data and b'"phi_l"' in data,
     ),
     LogFormat(
         "intel",
         read_intel,
-        has_text=lambda head, _: head.lstrip()[:1] == b"{" and b'"map"' in head,
+        has_text=lambda data, _: data[:64].lstrip()[:1] == b"{" and b'"map"' in data,
         n_files=(1, 2),
+    ),
+    LogFormat(
+        "intel, thinned",
+        lambda *paths: read_thinned_intel(*paths)[0],
+        has_text=lambda _, lines: bool(lines) and len(lines[0].split()) == N_THINNED_BEAMS,
+        n_files=(3, 3),
     ),
     LogFormat(
         "rawseeds",
@@ -138,10 +145,10 @@ def _format_of(path: Path) -> LogFormat:
     data = read_bytes(path)
     if _is_archive(data):
         return _format_of_names(list(read_members(path)), path)
-    text = data[:_HEAD_BYTES]
-    lines = [line for line in text.split(b"\n") if line.strip() and not line.startswith(b"#")]
+    first = data[:_HEAD_BYTES].split(b"\n")
+    lines = [line for line in first if line.strip() and not line.startswith(b"#")]
     for each in FORMATS:
-        if each.has_text(text, lines):
+        if each.has_text(data, lines):
             return each
     known = ", ".join(each.name for each in FORMATS)
     raise InputError(
@@ -163,7 +170,8 @@ def read_all(paths: Sequence[Path], robot: int | None = None) -> Team:
     Parameters
     ----------
     paths
-        The log. Some formats come in several files, in this order: Intel (raw, corrected);
+        The log. Some formats come in several files, in this order: Intel (raw, corrected; or
+        thinned: scans, odometry, matches);
         Rawseeds (odometry, scans, ground truth); Lego (motors, scans, reference, cylinders).
     robot
         Which robot of an MRCLAM set, by default 1; or of a team's file, from 0 on.
@@ -189,7 +197,7 @@ def read_all(paths: Sequence[Path], robot: int | None = None) -> Team:
     require(len(set(paths)) == len(paths), f"{first}: named twice; its files differ")
     require(
         robot is None or log.read is read_mrclam,
-        f"{first}: {log.name} logs are of one robot; leave out --robot",
+        f"{first}: {log.name} logs hold one robot; leave out --robot",
     )
     of_robot = {"robot": robot} if robot is not None else {}
     recording = log.read(*paths, **of_robot)

@@ -20,7 +20,7 @@ from sim.robot.drive import RobotGeometry
 from sim.sensors import Laser, Mount
 
 _NO_RETURN_M = 81.83  # what the log writes where nothing was seen
-_N_THINNED_BEAMS, _THINNED_MAX_RANGE_M = 180, 50.0
+N_THINNED_BEAMS, _THINNED_MAX_RANGE_M = 180, 50.0
 
 
 def parse_intel(data: bytes, where: str) -> tuple[Array, Array, Array]:
@@ -126,7 +126,7 @@ def read_thinned_intel(
         (N,) numbers of the scans whose stamps are known.
     """
     where = str(scans)
-    ranges = read_words(scans).table(_N_THINNED_BEAMS, "scans")
+    ranges = read_words(scans).table(N_THINNED_BEAMS, "scans")
     steps = read_words(odometry).table(3, "odometry")[: len(ranges) - 1]
     words = read_words(matches)
     lines = words.lines[1:]  # the first line names the columns
@@ -153,10 +153,10 @@ def read_thinned_intel(
         wheels,
         stamps,
         ranges,
-        _scanner(1.0, _N_THINNED_BEAMS, _THINNED_MAX_RANGE_M),
+        _scanner(1.0, N_THINNED_BEAMS, _THINNED_MAX_RANGE_M),
         None,
         RobotGeometry(wheel_radius_m, track_m),
-        {"source": "intel, thinned", "notes": notes},
+        {"source": "intel, thinned", "notes": notes, "stamps_known": rows.tolist()},
     )
     return recording, rows.astype(np.int64)
 

@@ -123,5 +123,5 @@ def to_recording(
         robot=RobotGeometry(float(np.mean(wheel_diameters_m)) / 2.0, axle_m),
         sensors={"encoder": Encoder()},
         truth=Truth(stamps.copy(), poses),
-        config={"source": "khepera"},
+        config={"source": "khepera", "truth_of": "laser"},
     )

@@ -244,7 +244,8 @@ def _laser(
     raw = np.stack([np.asarray(topic.messages[i].ranges, np.float32) for i in rows])
     lowest, highest = float(first.range_min), float(first.range_max)
     seen = (raw >= np.float32(lowest)) & (raw <= np.float32(highest))
-    ranges = np.where(seen, raw, np.float32(np.inf))
+    # a range at the maximum of a bag may have been seen
+    ranges, written = assemble.seen_ranges(np.where(seen, raw, np.inf), math.inf, notes)
     start = float(first.angle_min)
     T_base_laser = mounts.get(first.header.frame_id.lstrip("/"))
     if T_base_laser is None:
@@ -262,7 +263,7 @@ def _laser(
         n_beams=n_beams,
         fov_rad=min(fov, 2.0 * math.pi),
         min_range_m=max(lowest, 0.0),
-        max_range_m=highest,
+        max_range_m=min(highest, written),
         mount=Mount(x_m=x, y_m=y, z_m=z, yaw_rad=math.remainder(yaw, 2.0 * math.pi)),
     )
     return laser, Log.of(laser, stamps[rows], ranges_m=ranges)

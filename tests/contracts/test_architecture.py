@@ -54,6 +54,7 @@ ROOMS = (
     "studies",
     "gate",
     "bench",
+    "solve",
     "report",
     "judging",
     "sweeps",

@@ -8,7 +8,7 @@ import pytest
 from scipy import stats
 
 from estimators.base import Belief, Prior, run
-from estimators.graph.least_squares import PoseSightings
+from estimators.graph.camera_residuals import PoseSightings
 from estimators.graph.smoother import Smoother
 from estimators.landmarks.ekf_slam import EkfSlam
 from estimators.landmarks.fastslam import FastSLAM

@@ -5,7 +5,6 @@ import pytest
 
 from estimators.wheels import (
     EncoderTickOptions,
-    ForwardSlipOptions,
     WheelOptions,
     WheelPrediction,
 )
@@ -36,7 +35,7 @@ def test_covariance_is_slip_ticks_and_sideways_slip(travel_m):
 
 
 def test_what_both_wheels_slip_together_does_not_turn():
-    wheels = WheelPrediction(ForwardSlipOptions(forward_slip_m=5e-3), TRACK_M)
+    wheels = WheelPrediction(WheelOptions(forward_slip_m=5e-3), TRACK_M)
     motion, _, root = wheels.predict_in_full(frame(0.1, 0.1))
     alone = WheelPrediction(WheelOptions(), TRACK_M)
     more = motion.covariance - alone.predict(frame(0.1, 0.1)).covariance
@@ -52,7 +51,7 @@ def test_travel_is_netted_over_the_window():
     assert variances.tolist() == [0.0, 0.0]
 
 
-@pytest.mark.parametrize("made", [EncoderTickOptions, ForwardSlipOptions])
+@pytest.mark.parametrize("made", [EncoderTickOptions, WheelOptions])
 def test_wrong_options_are_named(made):
     for option in described(made):
         with pytest.raises(InputError, match=rf"^estimator\.{option.name} must be"):

@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from estimators.base import Estimate
 from estimators.graph.graph_slam import GraphSlam
 from estimators.odometry import Odometry
-from experiments.evaluation.relations import relation_errors
-from experiments.evaluation.time_sync import nearest_rows
+from experiments.evaluation.relations import judged_relations, relation_errors
 from experiments.judging.logs import (
     GRAPHS,
     freiburg,
@@ -35,11 +34,9 @@ from experiments.viewing.map import grid_along
 from sim import se2
 from sim.arrays import Array
 from sim.formats import carmen
-from sim.formats.relations import Relations
 from sim.recording import Recording
 from sim.sensors import Laser
 
-_TOLERANCE_S = 0.05
 _ORIGIN = np.zeros(3)
 # Ten times the laser's noise is believed of scans, since walls are not straight and people pass.
 # Chosen when no line was left out yet.
@@ -79,7 +76,7 @@ def scored(
     """
     scans, graph = recording.log("laser").stamps, carmen.read_carmen(GRAPHS[name])
     known = scans if known_stamps is None else known_stamps
-    judged = _shared(relations_of(name), known, graph.scan_stamps)
+    judged = judged_relations(relations_of(name), known, graph.scan_stamps)
     online, revised = track(GraphSlam(**_OPTIONS | options), recording)
     assert revised is not None
     at_scans = np.searchsorted(online.stamps, scans)
@@ -99,16 +96,6 @@ def scored(
     mean_m = KUEMMERLE[name]["graph"][0]
     rows.append({"log": name, "method": "graph (printed)", "translation_mean_m": mean_m})
     return rows, revised
-
-
-def _shared(relations: Relations, *stamps: Array) -> Relations:
-    """Relations between two different ones of each of these stamps (T,), s, or near them."""
-    kept = np.ones(len(relations.stamps), dtype=bool)
-    for known in stamps:
-        rows = nearest_rows(known, relations.stamps)
-        near = np.abs(known[rows] - relations.stamps) <= _TOLERANCE_S
-        kept &= near.all(axis=1) & (rows[:, 0] != rows[:, 1])
-    return Relations(relations.stamps[kept], relations.motion[kept])
 
 
 def closed_loops() -> tuple[pd.DataFrame, dict[str, NDArray[Any]]]:

@@ -1,8 +1,8 @@
 """The claim GI9: sightings of one another make a team's localization better.
 
 A world is the unit of inference. The paper's own method, the printed filter with 200 particles,
-decides; FastSLAM 2.0, EKF-SLAM and the batch baseline stand
-beside it, and what communication costs.
+decides; FastSLAM 2.0, EKF-SLAM and the batch baseline stand beside it, and what communication
+costs.
 """
 
 from collections.abc import Iterator, Mapping

@@ -10,7 +10,8 @@ from typer.testing import CliRunner
 from estimators.base import Prior
 from estimators.odometry import Odometry
 from experiments.calibration.from_log import calibrate_log
-from experiments.calibration.reference import Source
+from experiments.calibration.log_check import check_log
+from experiments.calibration.reference import Reference, Source, wheel_delay_s
 from experiments.calibration.slip import BLOCK_S, slip_of_blocks
 from experiments.cli.main import app
 from experiments.evaluation.metrics import position_errors_m
@@ -248,3 +249,31 @@ def test_command(tmp_path, log):
     assert ran.exit_code == 0, ran.output
     assert read_calibration(out).wheels.delay_s == pytest.approx(DELAY_S, abs=0.03)
     assert out.with_suffix(".png").stat().st_size > 10_000
+
+
+def test_a_laser_upside_down_is_found():
+    log = log_of(90.0, sensor="laser", with_truth=False)
+    readings = log.log("laser")
+    turned = readings["ranges_m"][:, ::-1].copy()
+    upside_down = log.with_log("laser", dataclasses.replace(readings, values={"ranges_m": turned}))
+    found = calibrate_log(upside_down)
+    assert found.calibration.sensors["laser"].mirrored
+    wheels = found.calibration.wheels
+    assert [wheels.gain_right, wheels.gain_left] == pytest.approx(GAINS, rel=0.02)
+    made = found.calibration.apply_to(upside_down)
+    np.testing.assert_array_equal(made.log("laser")["ranges_m"], readings["ranges_m"])
+    assert any("upside down" in line for line in check_log(upside_down))
+    assert not calibrate_log(log).calibration.sensors["laser"].mirrored
+
+
+def test_delay_that_no_part_shows_is_anything():
+    """A short log turned once: the interval is all that was tried, not NaN."""
+    stamps = np.arange(0.0, 12.0, 0.1)
+    heading = 0.5 * np.clip(stamps - 5.0, 0.0, 1.0)
+    half = heading * ROBOT.track_m / 2.0
+    wheels = WheelLog(stamps, np.stack([half, -half], axis=1))
+    poses = np.column_stack([0.0 * stamps, 0.0 * stamps, heading])
+    reference = Reference(Source.SCANS, stamps, poses, np.ones(len(stamps) - 1, bool))
+    found = wheel_delay_s(wheels, reference)
+    assert abs(found.value) < 0.1
+    assert (found.low, found.high) == pytest.approx((found.value - 1.0, found.value + 1.0))

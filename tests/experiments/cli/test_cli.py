@@ -282,7 +282,7 @@ def test_damaged_recordings_are_refused(tmp_path):
     refused(called("run", f"recording={path}"), "r.npz", "record again")
     log = tmp_path / "a.log"
     log.write_text("ODOM 0 0 0 0 0 0 0 nohost 0\n")
-    refused(called("run", f"recording={log}"), "a.log", "estima convert")
+    refused(called("run", f"recording={log}"), "a.log", "FLASER or ROBOTLASER1")
     refused(called("record", "-o", "."), ".npz")
     refused(called("convert", str(path), "-o", "."), "name the file")
     before = path.read_bytes()

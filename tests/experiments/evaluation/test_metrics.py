@@ -252,7 +252,7 @@ def test_frames_in_a_gap_of_the_truth_are_not_scored():
 
 def test_every_score_says_its_unit():
     recording = fakes.circle(n_frames=400)
-    pure = {"nees_mean", "nees_counted_share", "final_in_ellipse"}
+    pure = {"nees_mean", "nees_median", "nees_counted_share", "final_in_ellipse"}
     pure |= {"stamps_scored", "stamps_left_out"} | {f"inside_{p}_share" for p in (50, 90, 95)}
     keys = set(metrics.score(recording, fakes.estimate(recording)))
     assert {

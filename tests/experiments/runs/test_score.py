@@ -1,3 +1,4 @@
+import dataclasses
 import json
 
 import numpy as np
@@ -9,14 +10,16 @@ from evo.core.trajectory import PoseTrajectory3D
 
 from estimators.base import Estimate
 from experiments.cli import main as cli
+from experiments.evaluation.relations import relation_scores
 from experiments.runs.score import Scoring, describe_scoring, error_table, match_and_align
 from experiments.trajectories.convert import write_estimate
 from experiments.trajectories.read import read_trajectory
 from experiments.viewing.compare import reference_of
 from sim import se2
 from sim.errors import InputError
+from sim.formats.relations import Relations, write_relations
 from sim.formats.trajectory import sound_covariances
-from sim.recording import save
+from sim.recording import load, save
 from tests.fixtures import fakes
 
 _EVO = ("rmse", "mean", "median", "std", "min", "max", "sse")
@@ -396,3 +399,35 @@ def test_options_that_make_no_sense_are_named(files, tmp_path, monkeypatch, caps
         code, _, err = run(monkeypatch, capsys, "score", log, *wrong)
         assert code == 2
         assert named in err
+
+
+def test_relations_judge_too_and_alone(files, monkeypatch, capsys, tmp_path):
+    """By them a constant offset costs nothing, and no truth is needed."""
+    folder, _ = files
+    recording = load(folder / "run.npz")
+    ends = recording.frame_stamps[[[0, 30], [10, 50], [20, 55]]]
+    motion = se2.between(recording.truth_at(ends[:, 0]), recording.truth_at(ends[:, 1]))
+    motion[:, 0] += 0.3
+    write_relations(tmp_path / "true.relations", Relations(ends, motion))
+    save(dataclasses.replace(recording, truth=None), tmp_path / "blind.npz")
+    given = ("--relations", tmp_path / "true.relations", "--json", "--results", tmp_path)
+    for drive, with_truth in ((folder / "run.npz", True), (tmp_path / "blind.npz", False)):
+        code, out, _ = run(monkeypatch, capsys, "score", drive, folder / "est.tum", *given)
+        [row] = json.loads(out)
+        assert code == 0
+        assert row["n_relations"] == 3
+        assert row["relation_translation_m"] == pytest.approx(0.3, abs=0.05)
+        assert ("ate_rmse_m" in row) == with_truth
+    code, _, said = run(monkeypatch, capsys, "score", tmp_path / "blind.npz", folder / "est.tum")
+    assert code == 2
+    assert "no truth to score against" in said
+
+
+def test_of_a_thinned_log_only_known_stamps_are_judged():
+    recording = fakes.circle()
+    scans = recording.log("laser").stamps
+    relations = Relations(scans[[[0, 30], [10, 50]]], np.zeros((2, 3)))
+    known = dataclasses.replace(recording, config={"stamps_known": [0, 30]})
+    poses = recording.truth_at(scans)
+    assert relation_scores(recording, relations, scans, poses)["n_relations"] == 2
+    assert relation_scores(known, relations, scans, poses)["n_relations"] == 1

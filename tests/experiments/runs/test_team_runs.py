@@ -10,6 +10,7 @@ from estima import simulate
 from experiments.evaluation.metrics import position_errors_m, rms
 from experiments.gate.candidate import write_recordings
 from experiments.gate.suite import draw_run, read_suite, run_suite
+from experiments.runs.calibration import Calibration, Slip, Wheels, write_calibration
 from experiments.runs.evaluate import evaluate, scores_of_team, status_of_team
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Outcome, Status
@@ -262,3 +263,29 @@ def test_each_robot_draws_from_streams_of_its_own(monkeypatch):
     composed("route.distance_m=1").simulate_team()
     drawn = [state for state in states if state[0] in ("slip", "sensors")]
     assert len(drawn) == len(set(drawn)) == 4
+
+
+def test_a_calibration_is_each_robots_own_or_all_robots(tmp_path):
+    team = composed().recordings()
+    teams.save(team, tmp_path / "team.npz")
+    files = []
+    for number, gain in enumerate((1.02, 0.97)):
+        wheels = Wheels(gain_right=gain, gain_left=gain, track_m=0.2, delay_s=0.0)
+        slip = Slip(kr=1e-4 * (1 + number), kl=1e-4, forward_slip_m=3e-3)
+        found = Calibration(wheels, slip)
+        files.append(str(tmp_path / f"{number}.yaml"))
+        write_calibration(tmp_path / f"{number}.yaml", found, {})
+    read = [f"recording={tmp_path / 'team.npz'}", f"calibration=[{','.join(files)}]"]
+    experiment = composed(*read)
+    for gain, own, logged in zip((1.02, 0.97), experiment.recordings().robots, team.robots,
+                                 strict=True):  # fmt: skip
+        np.testing.assert_allclose(own.wheels.position_m, gain * logged.wheels.position_m)
+    believed = experiment.config["estimator"]
+    assert believed["kr"] == pytest.approx(1.5e-4)
+    assert believed["forward_slip_m"] == pytest.approx(3e-3)
+    [row] = evaluate(experiment)
+    assert row["status"] != Outcome.FAILED
+    alike = composed(read[0], f"calibration={files[0]}").recordings().robots
+    assert all(robot.robot.track_m == 0.2 for robot in alike)
+    with pytest.raises(InputError, match="3 files for a team of 2"):
+        composed(read[0], f"calibration=[{files[0]},{files[0]},{files[1]}]").recordings()

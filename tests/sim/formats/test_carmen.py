@@ -6,6 +6,7 @@ import pytest
 from sim import se2
 from sim.errors import InputError
 from sim.formats.carmen import read_carmen, to_recording, write_carmen
+from sim.formats.detect import kind_of, read_any
 from sim.formats.text import split_words
 from sim.robot.arc import arc_increment
 from tests.fixtures import fakes
@@ -134,3 +135,12 @@ def test_real_logs():
     gfs = read_carmen(DATA / "intel_lab/intel.gfs.log.gz")
     assert len(gfs.scan_stamps) == 910
     assert to_recording(gfs).duration_s > 2600.0
+
+
+def test_many_parameters_first_are_no_other_format(tmp_path):
+    """What a log is, is seen in all of it, not in its first lines."""
+    head = b"".join(b"PARAM robot_%d " % i + b"x" * 300 + b" 0 host 0\n" for i in range(245))
+    path = tmp_path / "a.log"
+    path.write_bytes(head + flaser_log())
+    assert kind_of(path) == "carmen"
+    assert len(read_any([path]).log("laser").stamps) == 3

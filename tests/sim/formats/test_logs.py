@@ -116,7 +116,7 @@ def test_files_and_robots_that_a_log_does_not_have(tmp_path):
     raw = write(tmp_path / "raw.json", samples.intel_json())
     with pytest.raises(InputError, match=r"raw\.json: named twice"):
         read_any([raw, raw])
-    with pytest.raises(InputError, match=r"raw\.json: intel logs are of one robot"):
+    with pytest.raises(InputError, match=r"raw\.json: intel logs hold one robot"):
         read_any([raw], 3)
     save(read_any([raw]), tmp_path / "one.npz")
     with pytest.raises(InputError, match=r"its robots are 0 to 0, got 3"):
