@@ -156,7 +156,8 @@ class ScanMatcher:
 
     def prepare(self, ranges_m: ArrayLike, laser: Laser) -> PreparedScan | None:
         """Prepare a scan of this laser; None if it shows too little to be registered."""
-        scan = prepare(ranges_m, laser.bearings_rad, laser.max_range_m)
+        curves = self.believed.metric == "point_to_line"
+        scan = prepare(ranges_m, laser.bearings_rad, laser.max_range_m, curves=curves)
         if self.max_gap_m is not None:
             scan = without_sparse_lines(scan, self.max_gap_m)
         return scan if len(scan.points) >= MIN_POINTS else None
