@@ -172,6 +172,7 @@ def register(
     gate_rad: float | None = None,
     heading_window_rad: float | None = None,
     rules: Rules = DEFAULT_RULES,
+    min_overlap: float = MIN_OVERLAP,
 ) -> Registration:
     """Find the pose of the source scan in the frame of the target scan.
 
@@ -197,6 +198,8 @@ def register(
         iteration; by default 30 degrees without an initial guess, and 0 (no search) with one.
     rules
         Which matches count, and when iterations end.
+    min_overlap
+        Share of the source's points that must agree with the target.
     """
     pose = np.zeros(3) if initial is None else np.array(initial, dtype=np.float64)
     if pose.shape != (3,) or not np.all(np.isfinite(pose)):
@@ -253,7 +256,7 @@ def register(
     )
     pose[2] = math.remainder(pose[2], 2.0 * math.pi)
     status = "ok"
-    if np.count_nonzero(fit.weights) < MIN_OVERLAP * len(fit.weights):
+    if np.count_nonzero(fit.weights) < min_overlap * len(fit.weights):
         status = "poor_overlap"
     elif not _positive_definite(information - MIN_INFORMATION_RATIO * spurious):
         status = "degenerate"

@@ -53,7 +53,10 @@ def _on_arc(
     """Normal of an arc near a point, and derivatives of the distance by its m and its bend."""
     _, n1, n2 = distance(segments, j, x, y)
     m1, m2, d = segments.normals[j, 0], segments.normals[j, 1], segments.distances_m[j]
-    facing, turned = n1 * m1 + n2 * m2, n1 * y - n2 * x  # as it moves outwards, and about the sensor
+    facing, turned = (
+        n1 * m1 + n2 * m2,
+        n1 * y - n2 * x,
+    )  # as it moves outwards, and about the sensor
     e1, e2 = d * d * facing * m1 - d * turned * m2, d * d * facing * m2 + d * turned * m1
     u = m1 * y - m2 * x - segments.bends[j, 1]
     return n1, n2, e1, e2, -facing * (u * u - segments.bends[j, 2])

@@ -289,9 +289,7 @@ def _grown(
 
 
 @njit(error_model="numpy", fastmath={"contract"})
-def _grow(
-    ranges: Array, rays: Array, noise: float, jumps: bool
-) -> tuple[Ints, Array, Ints]:
+def _grow(ranges: Array, rays: Array, noise: float, jumps: bool) -> tuple[Ints, Array, Ints]:
     """Lines from left to right, each as long as it goes: line of each point, lines, ends."""
     line_of_point = np.full(len(ranges), -1)
     lines = np.zeros((len(ranges) // _MIN_LINE_POINTS + 1, 2))
@@ -461,9 +459,7 @@ def _prepare(
             seen_m, rays, beams, noise, line_of_point, lines, information, ends
         )
     spacing = bearings[1] - bearings[0] if len(bearings) > 1 else 0.0
-    segments = _describe(
-        lines, information, ends, bends, seen_m, rays, beams, spacing, noise
-    )
+    segments = _describe(lines, information, ends, bends, seen_m, rays, beams, spacing, noise)
     return PreparedScan(
         bearings, seen_m, rays, points, beams, line_of_point, lines, information, ends, segments,
         noise, full_circle,

@@ -20,6 +20,7 @@ from estimators.gaussian import Gaussian
 from estimators.laser import icp_covariance
 from estimators.laser.icp import (
     DEFAULT_RULES,
+    MIN_OVERLAP,
     MIN_POINTS,
     Metric,
     PreparedScan,
@@ -28,6 +29,7 @@ from estimators.laser.icp import (
     prepare,
     register,
 )
+from estimators.laser.remembered import seen_again
 from estimators.laser.scan_lines import without_sparse_lines
 from sim import se2
 from sim.arrays import Array
@@ -170,6 +172,7 @@ class ScanMatcher:
         laser: Laser,
         rng: np.random.Generator,
         heading_window_rad: float = 0.0,
+        min_overlap: float = MIN_OVERLAP,
     ) -> Match:
         """Register a scan against a reference.
 
@@ -183,6 +186,8 @@ class ScanMatcher:
             For the covariance by sampling.
         heading_window_rad
             Half the range of headings to search, where the guess knows nothing of the turn.
+        min_overlap
+            Share of the scan's points that must agree with the reference.
         """
         mount = laser.mount.pose
         in_laser, _ = guess.in_sensor(mount)
@@ -196,6 +201,7 @@ class ScanMatcher:
             gate_rad=min(_LEAST_GATE_RAD + 4.0 * math.sqrt(max(turn, 0.0)), _MOST_GATE_RAD),
             heading_window_rad=heading_window_rad,
             rules=self.rules,
+            min_overlap=min_overlap,
         )
         if found.status in FAILED:
             return Match(guess, found.status, _NOTHING[:0], _EVERYTHING, found.overlap)
@@ -218,6 +224,14 @@ class ScanMatcher:
         leak = float(np.trace(spurious @ (np.outer(off, off) + spread)))
         covariance = motion.covariance + leak * match.known_covariance
         return dataclasses.replace(match, motion=Gaussian(motion.mean, covariance))
+
+    def seen_again(
+        self, scan: PreparedScan, other: PreparedScan, pose: Array, laser: Laser
+    ) -> float:
+        """Share of a scan's points that another scan should show, by T_other_scan of base_link."""
+        mount = laser.mount.pose
+        in_laser = se2.compose(se2.compose(se2.inverse(mount), pose), mount)
+        return seen_again(scan, other, in_laser)
 
     def sigma_m(self, laser: Laser) -> float:
         """Believed range noise, m."""
