@@ -41,7 +41,6 @@ _TINY = 1e-14  # keeps the update with a noiseless measurement solvable
 _KEY, _LAST, _POSE, _NEW = (slice(3 * i, 3 * i + 3) for i in range(4))
 _REVISITED = 0.7  # share of the thresholds of key frames within which one is taken up again
 _SEEN_AGAIN = 0.5  # share of a scan that a remembered key frame should see as well
-_AGREEING = 0.4  # share that must agree once it is registered
 _REVISIT_M = 0.5  # standard deviation of where it is; at more, graph_slam has to close the loop
 
 
@@ -224,9 +223,7 @@ class EkfIcp(EkfIcpOptions):
             return None
         place, reference = slice(12 + 3 * best, 15 + 3 * best), self._remembered[best]
         expected, _ = self._expected(place, _NEW)
-        match = self.matcher.match(
-            scan, reference, expected, self._laser, self._rng, min_overlap=_AGREEING
-        )
+        match = self.matcher.match(scan, reference, expected, self._laser, self._rng)
         if match.status != "ok" or not self._update(match, place, extras):
             return None
         far_m, far_rad = self.keyframe_distance_m, self.keyframe_turn_rad

@@ -173,6 +173,7 @@ def register(
     heading_window_rad: float | None = None,
     rules: Rules = DEFAULT_RULES,
     min_overlap: float = MIN_OVERLAP,
+    least_noise_m: float = 0.0,
 ) -> Registration:
     """Find the pose of the source scan in the frame of the target scan.
 
@@ -200,6 +201,8 @@ def register(
         Which matches count, and when iterations end.
     min_overlap
         Share of the source's points that must agree with the target.
+    least_noise_m
+        Of the ranges, where less is measured in the scans: coarse ranges look free of noise.
     """
     pose = np.zeros(3) if initial is None else np.array(initial, dtype=np.float64)
     if pose.shape != (3,) or not np.all(np.isfinite(pose)):
@@ -249,7 +252,7 @@ def register(
         planes = surface._replace(normals=of_points.normals, distances_m=of_points.distances_m)
     pair = Pair(
         source, target, whole_lines, metric != "point_to_point", surface, planes,
-        max(source.noise_m, target.noise_m),
+        max(source.noise_m, target.noise_m, least_noise_m),
     )  # fmt: skip
     fit, iterations, converged, normal, information, spurious, agreed, denied = _register(
         pair, pose, window, settings, stages

@@ -35,6 +35,7 @@ from sim.compiled import njit
 Scans = Literal["both", "last"]
 Matches = Literal["held", "sliding"]
 
+_LEAST_MEMBERS = 3  # points on a line before their mean counts
 UNKNOWN_M, UNKNOWN_RAD = 10.0, math.pi  # standard deviations of an unconstrained direction
 
 
@@ -221,6 +222,34 @@ def censi(
         noise = target.noise_m if sigma_range_m is None else sigma_range_m
         middle += noise**2 * by_target
     return _sandwich(A, middle, registration, everywhere=everywhere)
+
+
+@njit(error_model="numpy")
+def misfit(
+    target: PreparedScan, matches: Ints, weights: Array, residuals: Array, n_lines: int
+) -> float:
+    """How many times its variance the mean residual of a line has, on average; at least 1.
+
+    Residuals of a line that are noise have a mean of zero; where they do not, the line is not what
+    both scans saw (a chord, a person, another object), which no noise of the ranges describes.
+    """
+    sums, moments = np.zeros(n_lines), np.zeros(n_lines)
+    n_source, n_target = np.zeros(n_lines), np.zeros(n_lines)
+    for line in target.line_of_point:
+        if line >= 0:
+            n_target[line] += 1.0
+    for i in range(len(matches)):
+        if weights[i] > 0.0:
+            sums[matches[i]] += weights[i]
+            moments[matches[i]] += weights[i] * residuals[i]
+            n_source[matches[i]] += 1.0
+    squares, counted = 0.0, -3.0  # the pose follows three of them
+    for line in range(n_lines):
+        if n_source[line] >= _LEAST_MEMBERS:
+            variance = (1.0 + n_source[line] / max(n_target[line], 1.0)) * sums[line]
+            squares += moments[line] * moments[line] / variance
+            counted += 1.0
+    return max(squares / counted, 1.0) if counted >= 1.0 else 1.0
 
 
 def hessian(registration: Registration) -> Array:

@@ -21,6 +21,8 @@ from sim.errors import require
 
 _NOISE_FLOOR_M = 0.002  # quantised ranges can look free of noise
 _MEDIAN_OF_NORMAL = 0.6745  # median of |z|, z ~ N(0, 1)
+_QUARTER_OF_NORMAL = 0.3186  # lower quartile of |z|
+_SMOOTH_BENDS = 5.0  # standard deviations beyond which a second difference is a jump's
 _LEAST_BENDS = 10  # second differences from which a noise can be told
 _STEEPEST = 0.5  # measured over expected range; below, a beam runs nearly along its line
 _MOST_GROWTH = 0.3  # of 1 / range at a line's end: a wall may go on 3.3 times as far
@@ -193,10 +195,11 @@ def select(values: Array, rank: int) -> float:
 
 
 @njit(error_model="numpy", fastmath={"contract"})
-def _noise(ranges: Array, rays: Array, beams: Ints) -> float:
+def _noise(ranges: Array, rays: Array, beams: Ints, jumps: bool) -> float:
     """Standard deviation of the ranges, from second differences of 1 / range.
 
-    On a straight wall u[i-1] - 2 cos(step) u[i] + u[i+1] is zero for u = 1 / range.
+    On a straight wall u[i-1] - 2 cos(step) u[i] + u[i+1] is zero for u = 1 / range. With `jumps`
+    those far above the lower quartile are left out: among chair legs most span an edge.
     """
     found = np.empty(max(len(ranges), 1))
     n = 0
@@ -210,6 +213,10 @@ def _noise(ranges: Array, rays: Array, beams: Ints) -> float:
         n += 1
     if n < _LEAST_BENDS:
         return _NOISE_FLOOR_M
+    if jumps:
+        most = _SMOOTH_BENDS * select(found[:n], n // 4) / _QUARTER_OF_NORMAL
+        smooth = found[:n][found[:n] <= most]
+        return max(select(smooth, len(smooth) // 2) / _MEDIAN_OF_NORMAL, _NOISE_FLOOR_M)
     return max(select(found[:n], n // 2) / _MEDIAN_OF_NORMAL, _NOISE_FLOOR_M)
 
 
@@ -449,7 +456,7 @@ def _prepare(
         rays[k, 0], rays[k, 1] = math.cos(bearings[i]), math.sin(bearings[i])
         points[k, 0], points[k, 1] = ranges[i] * rays[k, 0], ranges[i] * rays[k, 1]
     seen_m = ranges[beams]
-    noise = _noise(seen_m, rays, beams)
+    noise = _noise(seen_m, rays, beams, curves)
     line_of_point, lines, ends = _grow(seen_m, rays, noise, curves)
     _recut(seen_m, rays, noise, line_of_point, lines, ends)
     lines, information, ends = _merge(seen_m, rays, beams, noise, line_of_point, lines, ends)

@@ -45,6 +45,7 @@ _LEAST_SIGMA_M = 1e-4  # a laser without noise still has rounding
 # Bounds of the error that a guess is assumed to have
 _LEAST_GATE_M, _MOST_GATE_M = 0.5, 2.0
 _LEAST_GATE_RAD, _MOST_GATE_RAD = 0.02, 0.2
+_MIN_OVERLAP = 0.4  # less than for scans one after another: a turn takes a third out of view
 _EVERYTHING, _NOTHING = np.eye(3), np.zeros((3, 3))
 
 
@@ -156,10 +157,14 @@ class ScanMatcher:
         """Which matches count, and when iterations end."""
         return self.believed if isinstance(self.believed, Rules) else DEFAULT_RULES
 
+    @property
+    def curves(self) -> bool:
+        """Whether scans are cut into lines and arcs, as the metric that matches them needs it."""
+        return self.believed.metric == "point_to_line"
+
     def prepare(self, ranges_m: ArrayLike, laser: Laser) -> PreparedScan | None:
         """Prepare a scan of this laser; None if it shows too little to be registered."""
-        curves = self.believed.metric == "point_to_line"
-        scan = prepare(ranges_m, laser.bearings_rad, laser.max_range_m, curves=curves)
+        scan = prepare(ranges_m, laser.bearings_rad, laser.max_range_m, curves=self.curves)
         if self.max_gap_m is not None:
             scan = without_sparse_lines(scan, self.max_gap_m)
         return scan if len(scan.points) >= MIN_POINTS else None
@@ -172,7 +177,6 @@ class ScanMatcher:
         laser: Laser,
         rng: np.random.Generator,
         heading_window_rad: float = 0.0,
-        min_overlap: float = MIN_OVERLAP,
     ) -> Match:
         """Register a scan against a reference.
 
@@ -186,8 +190,6 @@ class ScanMatcher:
             For the covariance by sampling.
         heading_window_rad
             Half the range of headings to search, where the guess knows nothing of the turn.
-        min_overlap
-            Share of the scan's points that must agree with the reference.
         """
         mount = laser.mount.pose
         in_laser, _ = guess.in_sensor(mount)
@@ -201,7 +203,8 @@ class ScanMatcher:
             gate_rad=min(_LEAST_GATE_RAD + 4.0 * math.sqrt(max(turn, 0.0)), _MOST_GATE_RAD),
             heading_window_rad=heading_window_rad,
             rules=self.rules,
-            min_overlap=min_overlap,
+            min_overlap=_MIN_OVERLAP if self.curves else MIN_OVERLAP,
+            least_noise_m=self.sigma_m(laser) if self.curves else 0.0,
         )
         if found.status in FAILED:
             return Match(guess, found.status, _NOTHING[:0], _EVERYTHING, found.overlap)
@@ -256,4 +259,10 @@ class ScanMatcher:
                 found, source, target, of_guess, sigma_m, matches="sliding", rules=self.rules
             )
         scans: icp_covariance.Scans = "last" if self.believed.covariance == "censi_last" else "both"
+        if self.curves:
+            noise_m = max(source.noise_m, target.noise_m)
+            scale = icp_covariance.misfit(
+                target, found.matches, found.weights, found.residuals_m, len(target.lines)
+            )
+            sigma_m = max(sigma_m, noise_m * math.sqrt(scale))
         return icp_covariance.censi(found, source, target, sigma_m, scans=scans, matches="sliding")

@@ -64,7 +64,7 @@ class _Perfect:
     def seen_again(self, scan, other, pose, laser):
         return 1.0
 
-    def match(self, scan, reference, guess, laser, rng, min_overlap=0.6):
+    def match(self, scan, reference, guess, laser, rng):
         a, b = int(reference[0]), int(scan[0])
         motion = se2.between(self.apparent[a], self.apparent[b])
         motion = motion + self.rng.multivariate_normal(np.zeros(3), (1 - self.share) * self.R)
