@@ -1,4 +1,4 @@
-"""One self-contained page of a sweep: chart, means, best and worst runs, command."""
+"""One self-contained page of a sweep: answer, chart, means, best and worst runs, command."""
 
 from __future__ import annotations
 
@@ -37,6 +37,7 @@ from experiments.sweeps.collect import (
 from experiments.sweeps.commands import commands, config_dir_option, noted_config_dir
 from experiments.sweeps.summary import ERROR, summary
 from experiments.sweeps.until import read_decided
+from experiments.sweeps.winner import find_winner
 from sim.errors import printable, require
 from sim.files import write_text
 from sim.yaml_file import read_yaml
@@ -101,6 +102,7 @@ def write_sweep_page(
         called=shlex.quote(name),
         n_runs=len(table),
         unfinished=unfinished_sweeps(folder),
+        answer=found_winner.sentences() if (found_winner := find_winner(table)) else [],
         decided=decided and {**decided, "metric": titled(decided["metric"])},
         controls=_controls(every, drawn_by, settings, metrics),
         filters=[
