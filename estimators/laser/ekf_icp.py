@@ -41,6 +41,7 @@ _TINY = 1e-14  # keeps the update with a noiseless measurement solvable
 _KEY, _LAST, _POSE, _NEW = (slice(3 * i, 3 * i + 3) for i in range(4))
 _REVISITED = 0.7  # share of the thresholds of key frames within which one is taken up again
 _SEEN_AGAIN = 0.5  # share of a scan that a remembered key frame should see as well
+_MOST_WEAKENED = 150.0  # times its variance that the innovation of one may have
 _REVISIT_M = 0.5  # standard deviation of where it is; at more, graph_slam has to close the loop
 
 
@@ -224,7 +225,13 @@ class EkfIcp(EkfIcpOptions):
         place, reference = slice(12 + 3 * best, 15 + 3 * best), self._remembered[best]
         expected, _ = self._expected(place, _NEW)
         match = self.matcher.match(scan, reference, expected, self._laser, self._rng)
-        if match.status != "ok" or not self._update(match, place, extras):
+        if match.status != "ok":
+            return None
+        found: dict[str, Any] = {}
+        taken = self._update(match, place, found, weaken=True)
+        if "weakened" in found or not taken:
+            extras["status"] = "inconsistent"
+        if not taken:
             return None
         far_m, far_rad = self.keyframe_distance_m, self.keyframe_turn_rad
         if exceeds(apart[best], _REVISITED * far_m, _REVISITED * far_rad):
@@ -257,10 +264,13 @@ class EkfIcp(EkfIcpOptions):
         self._mean, self._covariance, self._old.factor = before
         return False
 
-    def _update(self, match: Match, place: slice, extras: dict[str, Any]) -> bool:
+    def _update(
+        self, match: Match, place: slice, extras: dict[str, Any], *, weaken: bool = False
+    ) -> bool:
         """Correct the state by the pose of the newest scan in that of another.
 
-        Returns False, with the state as before, if the innovation lies outside the gate.
+        Returns False, with the state as before, if the innovation lies outside the gate. With
+        `weaken` it may lie further off, but counts only as far as it would then be usual.
         """
         expected, by_twist = self._expected(place, _NEW)
         C, R, P = match.held, match.motion.covariance, self._covariance
@@ -272,11 +282,14 @@ class EkfIcp(EkfIcpOptions):
         noise = (1.0 - self.shared_noise) * C @ R @ C.T + _TINY * np.eye(len(C))
         cross = (P[:, _NEW] - P[:, place]) @ by_twist.T
         S = by_twist @ (cross[_NEW] - cross[place]) + noise
-        gain = np.linalg.solve(S, cross.T).T
         nis = float(innovation @ np.linalg.solve(S, innovation)) if len(C) else 0.0
         extras["nis"], extras["nis_dof"] = nis, len(C)
         if nis > self._gates[len(C)]:
-            return False
+            if not weaken or nis > _MOST_WEAKENED * len(C):
+                return False
+            extras["weakened"] = True
+            S = S * (nis / len(C))
+        gain = np.linalg.solve(S, cross.T).T
         lost = (cross - gain @ (S / 2.0)) @ gain.T
         self._covariance = P - lost - lost.T
         self._old.learn(by_twist, place, _NEW, S, innovation, gain)
