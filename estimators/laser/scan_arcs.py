@@ -119,7 +119,7 @@ def _is_arc(fit: Array, cost: float, steepest: float, n: int, noise: float) -> b
     """Whether a bend is significant, within what a parabola can follow, and fits n points."""
     if not (cost <= (n + _MISFIT * math.sqrt(2.0 * n)) * noise * noise and steepest < _MOST_SLOPE):
         return False
-    return abs(fit[5]) * math.sqrt(fit[8]) > _SIGNIFICANT * noise
+    return bool(abs(fit[5]) * math.sqrt(fit[8]) > _SIGNIFICANT * noise)
 
 
 @njit(error_model="numpy", fastmath={"contract"})
