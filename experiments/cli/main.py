@@ -86,6 +86,7 @@ _COMMANDS: dict[str, Callable[..., None]] = {  # as `estima --help` lists them
     "conform": score.conform,
     "check": project.check,
     "bisect": project.bisect,
+    "history": project.history,
     "bench": project.bench,
     "table": tables.table,
     "plot": tables.plot,

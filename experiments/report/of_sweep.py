@@ -38,9 +38,11 @@ def table_of(
     against: str | None,
     metrics: Sequence[str],
     size: str | None,
+    *,
+    efficiency: bool = False,
 ) -> str:
     """Mean errors of a sweep as lines, or in a file; then it says how many rows that has."""
-    found = summary(rows, against, metrics)
+    found = summary(rows, against, metrics, efficiency=efficiency)
     note = notes(found, against)
     if out is not None:
         write_table(found, note, out, Path(name).name, size)
