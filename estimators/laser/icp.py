@@ -46,6 +46,7 @@ _WIDTHS = {"tukey": 6.0, "huber": 1.345, "none": math.inf}
 _AGREEMENT = 6.0  # range standard deviations from a line of the other scan
 MIN_POINTS = 3  # of a scan that can be registered
 MIN_OVERLAP = 0.6  # share of the source's points that must agree with the target
+MIN_OVERLAP_OF_CURVES = 0.4  # of scans cut at jump edges: a turn takes a third out of view
 MIN_AGREEMENT = 0.5  # the same of those, in both scans, that bear on any one direction
 MIN_INFORMATION_RATIO = 4.0  # times the spurious information that the noise of the lines makes
 
@@ -172,8 +173,6 @@ def register(
     gate_rad: float | None = None,
     heading_window_rad: float | None = None,
     rules: Rules = DEFAULT_RULES,
-    min_overlap: float = MIN_OVERLAP,
-    least_noise_m: float = 0.0,
 ) -> Registration:
     """Find the pose of the source scan in the frame of the target scan.
 
@@ -199,10 +198,6 @@ def register(
         iteration; by default 30 degrees without an initial guess, and 0 (no search) with one.
     rules
         Which matches count, and when iterations end.
-    min_overlap
-        Share of the source's points that must agree with the target.
-    least_noise_m
-        Of the ranges, where less is measured in the scans: coarse ranges look free of noise.
     """
     pose = np.zeros(3) if initial is None else np.array(initial, dtype=np.float64)
     if pose.shape != (3,) or not np.all(np.isfinite(pose)):
@@ -252,13 +247,14 @@ def register(
         planes = surface._replace(normals=of_points.normals, distances_m=of_points.distances_m)
     pair = Pair(
         source, target, whole_lines, metric != "point_to_point", surface, planes,
-        max(source.noise_m, target.noise_m, least_noise_m),
+        max(source.noise_m, target.noise_m),
     )  # fmt: skip
     fit, iterations, converged, normal, information, spurious, agreed, denied = _register(
         pair, pose, window, settings, stages
     )
     pose[2] = math.remainder(pose[2], 2.0 * math.pi)
     status = "ok"
+    min_overlap = MIN_OVERLAP_OF_CURVES if source.curves else MIN_OVERLAP
     if np.count_nonzero(fit.weights) < min_overlap * len(fit.weights):
         status = "poor_overlap"
     elif not _positive_definite(information - MIN_INFORMATION_RATIO * spurious):

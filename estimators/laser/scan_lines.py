@@ -98,6 +98,8 @@ class PreparedScan(NamedTuple):
         Standard deviation of the ranges about straight walls, measured in the scan itself.
     full_circle
         Whether the last beam is the neighbour of the first.
+    curves
+        Whether it is cut at jump edges, and chords are joined to arcs: see `prepare`.
     """
 
     bearings_rad: Array
@@ -112,6 +114,7 @@ class PreparedScan(NamedTuple):
     segments: Segments
     noise_m: float
     full_circle: bool
+    curves: bool
 
 
 def prepare(
@@ -399,9 +402,10 @@ def _merge(
 @njit(error_model="numpy", fastmath={"contract"})
 def _describe(
     lines: Array, information: Array, ends: Ints, bends: Array, ranges: Array, rays: Array,
-    beams: Ints, spacing: float, noise: float,
+    beams: Ints, errors: tuple[float, float],
 ) -> Segments:  # fmt: skip
-    """The lines as segments."""
+    """The lines as segments; `errors` are the spacing of the beams, rad, and their noise, m."""
+    spacing, noise = errors
     n = len(lines)
     normals, distances, spans = np.empty((n, 2)), np.empty(n), np.empty((n, 2))
     end_rays, variances = np.empty((n, 2, 2)), np.empty(n)
@@ -466,8 +470,8 @@ def _prepare(
             seen_m, rays, beams, noise, line_of_point, lines, information, ends
         )
     spacing = bearings[1] - bearings[0] if len(bearings) > 1 else 0.0
-    segments = _describe(lines, information, ends, bends, seen_m, rays, beams, spacing, noise)
+    segments = _describe(lines, information, ends, bends, seen_m, rays, beams, (spacing, noise))
     return PreparedScan(
         bearings, seen_m, rays, points, beams, line_of_point, lines, information, ends, segments,
-        noise, full_circle,
+        noise, full_circle, curves,
     )  # fmt: skip

@@ -20,7 +20,6 @@ from estimators.gaussian import Gaussian
 from estimators.laser import icp_covariance
 from estimators.laser.icp import (
     DEFAULT_RULES,
-    MIN_OVERLAP,
     MIN_POINTS,
     Metric,
     PreparedScan,
@@ -45,7 +44,6 @@ _LEAST_SIGMA_M = 1e-4  # a laser without noise still has rounding
 # Bounds of the error that a guess is assumed to have
 _LEAST_GATE_M, _MOST_GATE_M = 0.5, 2.0
 _LEAST_GATE_RAD, _MOST_GATE_RAD = 0.02, 0.2
-_MIN_OVERLAP = 0.4  # less than for scans one after another: a turn takes a third out of view
 _EVERYTHING, _NOTHING = np.eye(3), np.zeros((3, 3))
 
 
@@ -165,6 +163,8 @@ class ScanMatcher:
     def prepare(self, ranges_m: ArrayLike, laser: Laser) -> PreparedScan | None:
         """Prepare a scan of this laser; None if it shows too little to be registered."""
         scan = prepare(ranges_m, laser.bearings_rad, laser.max_range_m, curves=self.curves)
+        if self.curves:  # coarse ranges look free of noise
+            scan = scan._replace(noise_m=max(scan.noise_m, self.sigma_m(laser)))
         if self.max_gap_m is not None:
             scan = without_sparse_lines(scan, self.max_gap_m)
         return scan if len(scan.points) >= MIN_POINTS else None
@@ -203,8 +203,6 @@ class ScanMatcher:
             gate_rad=min(_LEAST_GATE_RAD + 4.0 * math.sqrt(max(turn, 0.0)), _MOST_GATE_RAD),
             heading_window_rad=heading_window_rad,
             rules=self.rules,
-            min_overlap=_MIN_OVERLAP if self.curves else MIN_OVERLAP,
-            least_noise_m=self.sigma_m(laser) if self.curves else 0.0,
         )
         if found.status in FAILED:
             return Match(guess, found.status, _NOTHING[:0], _EVERYTHING, found.overlap)

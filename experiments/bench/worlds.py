@@ -1,8 +1,8 @@
 """Error and consistency of the fusion of wheels and laser in six classes of world, beside others.
 
 Drives are those of `study=board/CLASS`: 60 m, 10 scans a second of 721 beams. The other methods are
-those of the extra `peers` that are installed, and the paper's filter. Ratios are of geometric means
-over the drives; the best other method is chosen by the same drives, which favours it.
+those of the extra `peers` that are installed, and the paper's filter. Ratios compare geometric
+means over the drives; the best other method is chosen by the same drives, which favours it.
 """
 
 from collections.abc import Collection, Iterator

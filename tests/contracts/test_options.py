@@ -71,7 +71,7 @@ def digest_of_defaults(options):
 # A default decides results: who changes one says so in CHANGELOG.md, and here.
 DEFAULTS = {
     "DifferentialDrive": "4c424886",
-    "EkfIcp": "471fe7e5",
+    "EkfIcp": "13ab313a",
     "EkfIcpPaper": "54115b9c",
     "EkfSlam": "0be448aa",
     "Encoder": "9c7c1c0b",

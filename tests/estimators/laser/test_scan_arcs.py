@@ -56,7 +56,7 @@ def errors(walls, *, curves):
     for target_m, source_m in pairs(walls):
         target, source = (prepare(r, BEARINGS_RAD, curves=curves) for r in (target_m, source_m))
         guess = MOTION + np.array([0.02, -0.02, 0.01])
-        found = register(source, target, guess, gate_m=0.5, gate_rad=0.08, min_overlap=0.4)
+        found = register(source, target, guess, gate_m=0.5, gate_rad=0.08)
         if found.status == "poor_overlap":
             continue
         R = icp_covariance.censi(found, source, target, SIGMA_M)
