@@ -289,7 +289,7 @@ class EkfIcp(EkfIcpOptions):
                 return False
             extras["weakened"] = True
             S = S * (nis / len(C))
-        gain: Array = np.linalg.solve(S, cross.T).T
+        gain = np.asarray(np.linalg.solve(S, cross.T).T, dtype=np.float64)
         lost = (cross - gain @ (S / 2.0)) @ gain.T
         self._covariance = P - lost - lost.T
         self._old.learn(by_twist, place, _NEW, S, innovation, gain)

@@ -1,6 +1,6 @@
 """Poses of key frames that a filter remembers, and which of them a scan should see again.
 
-Between two changes of the key frame all measurements are of the few poses in use. What they teach
+Between two changes of the key frame all measurements concern the few poses in use. What they teach
 about the others is kept as a factor of their covariance, and applied once the others are needed
 (the compressed filter of Guivant and Nebot, Optimization of the simultaneous localization and
 map-building algorithm for real-time implementation, T-RA 17, 2001).
