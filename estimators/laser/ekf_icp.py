@@ -10,14 +10,16 @@ coordinates, registrations would spuriously inform the absolute heading once it 
 
 import dataclasses
 import math
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import Field
 from scipy.special import chdtri
 
 from estimators.base import Belief, Prior
-from estimators.gaussian import STILL, Gaussian, between, compose, rotate, update, wrap
+from estimators.gaussian import STILL, Gaussian, between, compose, rotate, wrap
 from estimators.laser.icp import PreparedScan, Rules
+from estimators.laser.remembered import RememberedPoses
 from estimators.laser.scan_matching import (
     KeyFrameOptions,
     Match,
@@ -25,6 +27,7 @@ from estimators.laser.scan_matching import (
     exceeds,
 )
 from estimators.wheels import EncoderTickOptions, WheelPrediction
+from sim import se2
 from sim.arrays import Array
 from sim.errors import require
 from sim.options import NonNegative, Probability, Share, options
@@ -33,9 +36,13 @@ from sim.recording import Frame
 _PATIENCE = 2  # scans in a row that may fail before the newest becomes the key frame
 _ORIGIN_STEP_M = 1e4  # the start is taken this near to the origin: twists lose digits far from it
 _TINY = 1e-14  # keeps the update with a noiseless measurement solvable
-# Places in the state: key frame, last scan, robot, and for the time of an update the newest scan
+# Places in the state: key frame, last scan, robot, then the remembered key frames; for the time of
+# an update the newest scan stands before those
 _KEY, _LAST, _POSE, _NEW = (slice(3 * i, 3 * i + 3) for i in range(4))
-_ROWS = np.arange(12)
+_REVISITED = 0.7  # share of the thresholds of key frames within which one is taken up again
+_SEEN_AGAIN = 0.5  # share of a scan that a remembered key frame should see as well
+_MOST_WEAKENED = 150.0  # times its variance that the innovation of one may have
+_REVISIT_M = 0.5  # standard deviation of where it is; at more, graph_slam has to close the loop
 
 
 @options("estimator")
@@ -54,6 +61,11 @@ class EkfIcpOptions(EncoderTickOptions, KeyFrameOptions, Rules, MatcherOptions):
     """What a wheel may slip at once, as a standard deviation, m: then a registration outside the
     gate that did not fail is explained by slip since the last scan, which neither kr nor kl
     describes. 0: it is left out."""
+    keyframe_distance_m: NonNegative = 1.0
+    keyframe_turn_rad: NonNegative = 0.7
+    remembered: Annotated[int, Field(ge=0, le=1000)] = 100
+    """Key frames that are remembered besides the one in use, those left last. A new one is
+    registered with that of them which it should see again and which would teach most."""
     shared_noise: Share = 0.75
     """Share of a registration's covariance that comes from the scans' own errors, half from
     each; 0: registrations are independent. Registrations before and after a key frame then
@@ -106,12 +118,14 @@ class EkfIcp(EkfIcpOptions):
         self._last: PreparedScan | None = None
         # of the key frame's first degenerate match, as twists: as in `Match`
         self._directions: tuple[Array, Array] | None = None
+        self._remembered: list[PreparedScan] = []
         # (9,): apparent poses of the key frame and of the last scan, pose of base_link; in map,
         # less its origin here
         self._mean = np.tile(start.mean, 3)
         # of the twists in map that take the means to the true poses
         to_twist = _from_twist(-start.mean)
         self._covariance = np.tile(to_twist @ start.covariance @ to_twist.T, (3, 3))
+        self._old = RememberedPoses(9)
         self._failures = 0
         share = self.gate_probability
         self._gates = [math.inf if share is None else chdtri(d, share) for d in range(4)]
@@ -162,12 +176,12 @@ class EkfIcp(EkfIcpOptions):
             if place is _KEY:
                 match = self._as_before(match)
             if self._take_in(match, place, extras):
-                return self._go_on(scan, match, place, reference)
+                return self._go_on(scan, match, place, reference, extras)
             extras["registration_status"] = "gated"
             outside = match, place, reference
         if outside is not None and self._take_in_after_burst(*outside[:2], extras):
             extras["registration_status"] = outside[0].status
-            return self._go_on(scan, *outside)
+            return self._go_on(scan, *outside, extras)
         extras["status"] = extras["registration_status"]
         self._insert(self._own_noise(scan))
         self._failures += 1
@@ -175,25 +189,66 @@ class EkfIcp(EkfIcpOptions):
         return self._keep(scan if lost else self._key, scan, (_NEW if lost else _KEY, _NEW))
 
     def _go_on(
-        self, scan: PreparedScan, match: Match, place: slice, reference: PreparedScan
+        self,
+        scan: PreparedScan,
+        match: Match,
+        place: slice,
+        reference: PreparedScan,
+        extras: dict[str, Any],
     ) -> None:
-        """Keep the reference as key frame, or take the scan, which was registered, for it."""
+        """Keep the reference as key frame, or take up another, or the registered scan."""
         self._failures = 0
-        left_key = self.left_key_frame(match.motion.mean)
-        key, source = (scan, _NEW) if left_key else (reference, place)
+        key, source = reference, place
+        if self.left_key_frame(match.motion.mean):
+            key, source = self._revisit(scan, extras) or (scan, _NEW)
         self._keep(key, scan, (source, _NEW))
 
-    def _expected(self, place: slice) -> tuple[Gaussian, Array]:
+    def _revisit(
+        self, scan: PreparedScan, extras: dict[str, Any]
+    ) -> tuple[PreparedScan, slice] | None:
+        """Register a scan, which is in the state, with a remembered key frame that it sees again.
+
+        Returns that key frame if it is near enough to be the reference.
+        """
+        self._expand()
+        apart = se2.between(self._mean[12:].reshape(-1, 3), self._mean[_POSE])
+        best, most_m2 = None, 0.0
+        for i, other in enumerate(self._remembered[:-1]):  # the last one was left just before
+            place = slice(12 + 3 * i, 15 + 3 * i)
+            if self.matcher.seen_again(scan, other, apart[i], self._laser) < _SEEN_AGAIN:
+                continue
+            spread_m2 = float(np.trace(self._expected(place, _NEW)[0].covariance[:2, :2]))
+            if most_m2 < spread_m2 < _REVISIT_M**2:
+                best, most_m2 = i, spread_m2
+        if best is None:
+            return None
+        place, reference = slice(12 + 3 * best, 15 + 3 * best), self._remembered[best]
+        expected, _ = self._expected(place, _NEW)
+        match = self.matcher.match(scan, reference, expected, self._laser, self._rng)
+        if match.status != "ok":
+            return None
+        found: dict[str, Any] = {}
+        taken = self._update(match, place, found, weaken=True)
+        if "weakened" in found or not taken:
+            extras["status"] = "inconsistent"
+        if not taken:
+            return None
+        far_m, far_rad = self.keyframe_distance_m, self.keyframe_turn_rad
+        if exceeds(apart[best], _REVISITED * far_m, _REVISITED * far_rad):
+            return None
+        return reference, place
+
+    def _expected(self, place: slice, pose: slice = _POSE) -> tuple[Gaussian, Array]:
         """Pose relative to a clone's, with its covariance; its derivative (3, 3) by the twists.
 
         A twist that both poses share changes nothing, so the derivative by the clone's twist is
         minus that by the robot's: the filter learns nothing that the scans do not measure.
         """
-        relative, _, by_pose = between(self._mean[place], self._mean[_POSE])
-        by_twist = by_pose @ _from_twist(self._mean[_POSE])
+        relative, _, by_pose = between(self._mean[place], self._mean[pose])
+        by_twist = by_pose @ _from_twist(self._mean[pose])
         P = self._covariance
-        cross = P[place, _POSE]
-        spread = P[place, place] + P[_POSE, _POSE] - cross - cross.T
+        cross = P[place, pose]
+        spread = P[place, place] + P[pose, pose] - cross - cross.T
         return Gaussian(relative, by_twist @ spread @ by_twist.T), by_twist
 
     def _take_in(self, match: Match, place: slice, extras: dict[str, Any]) -> bool:
@@ -201,25 +256,45 @@ class EkfIcp(EkfIcpOptions):
 
         Returns False, with the state as before, if the innovation lies outside the gate.
         """
-        expected, by_twist = self._expected(place)
-        C, R, share = match.held, match.motion.covariance, self.shared_noise
+        before = self._mean, self._covariance, self._old.factor
+        shared = self.shared_noise / 2.0 * match.known_covariance
+        self._insert(rotate(shared, self._mean[place][2]))
+        if taken := self._update(match, place, extras):
+            return taken
+        self._mean, self._covariance, self._old.factor = before
+        return False
+
+    def _update(
+        self, match: Match, place: slice, extras: dict[str, Any], *, weaken: bool = False
+    ) -> bool:
+        """Correct the state by the pose of the newest scan in that of another.
+
+        Returns False, with the state as before, if the innovation lies outside the gate. With
+        `weaken` it may lie further off, but counts only as far as it would then be usual.
+        """
+        expected, by_twist = self._expected(place, _NEW)
+        C, R, P = match.held, match.motion.covariance, self._covariance
         off = match.motion.mean - expected.mean
         off[2] = wrap(off[2])
-        innovation = C @ off
+        innovation, by_twist = C @ off, C @ by_twist
         extras["registration_covariance"] = R
-        # the clone's half of what is shared is in the state already
-        S = C @ (expected.covariance + (1.0 - share / 2.0) * R) @ C.T
+        # the halves of what is shared are in the state already
+        noise = (1.0 - self.shared_noise) * C @ R @ C.T + _TINY * np.eye(len(C))
+        cross = (P[:, _NEW] - P[:, place]) @ by_twist.T
+        S = by_twist @ (cross[_NEW] - cross[place]) + noise
         nis = float(innovation @ np.linalg.solve(S, innovation)) if len(C) else 0.0
         extras["nis"], extras["nis_dof"] = nis, len(C)
         if nis > self._gates[len(C)]:
-            return False
-        self._insert(rotate(share / 2.0 * match.known_covariance, self._mean[place][2]))
-        H = np.zeros((3, 12))
-        H[:, place], H[:, _NEW] = -by_twist, by_twist
-        noise = (1.0 - share) * C @ R @ C.T + _TINY * np.eye(len(C))
-        twists, self._covariance = update(np.zeros(12), self._covariance, innovation, C @ H, noise)
-        for part in (_KEY, _LAST, _POSE, _NEW):
-            self._mean[part] = _moved(self._mean[part], twists[part])
+            if not weaken or nis > _MOST_WEAKENED * len(C):
+                return False
+            extras["weakened"] = True
+            S = S * (nis / len(C))
+        gain = np.asarray(np.linalg.solve(S, cross.T).T, dtype=np.float64)
+        lost = (cross - gain @ (S / 2.0)) @ gain.T
+        self._covariance = P - lost - lost.T
+        self._old.learn(by_twist, place, _NEW, S, innovation, gain)
+        twists = (gain @ innovation).reshape(-1, 3)
+        self._mean = se2.compose(se2.exp(twists), self._mean.reshape(-1, 3)).ravel()
         return True
 
     def _take_in_after_burst(self, match: Match, place: slice, extras: dict[str, Any]) -> bool:
@@ -258,21 +333,37 @@ class EkfIcp(EkfIcpOptions):
         The noise (3, 3) is in the coordinates of map.
         """
         to_twist = _from_twist(-self._mean[_POSE])
-        self._mean = np.concatenate([self._mean, self._mean[_POSE]])
-        P = np.empty((12, 12))
-        P[:9, :9] = self._covariance
-        P[_NEW, :9] = self._covariance[_POSE]
-        P[:9, _NEW] = self._covariance[:, _POSE]
-        P[_NEW, _NEW] = self._covariance[_POSE, _POSE] + to_twist @ noise @ to_twist.T
-        self._covariance = P
+        self._select(_KEY, _LAST, _POSE, _POSE, slice(9, None))
+        self._covariance[_NEW, _NEW] += to_twist @ noise @ to_twist.T
+
+    def _select(self, *places: slice) -> None:
+        """Make these the places of the state, in this order."""
+        every = np.arange(len(self._mean))
+        rows = np.concatenate([every[place] for place in places])
+        self._mean, self._covariance = self._mean[rows], self._covariance[np.ix_(rows, rows)]
+        self._old.select(rows)
+
+    def _expand(self) -> None:
+        """Append the remembered poses to the state."""
+        self._mean, self._covariance = self._old.join(self._mean, self._covariance)
 
     def _keep(self, key: PreparedScan, last: PreparedScan, places: tuple[slice, slice]) -> None:
-        """Keep two of the apparent poses, and the robot's, and drop the others."""
-        if key is not self._key:
-            self._directions = None
+        """Keep two of the apparent poses, the robot's, and those of remembered key frames."""
+        if key is self._key:
+            self._last = last
+            return self._select(*places, _POSE)
+        self._directions = None
+        self._expand()
+        others = {12 + 3 * i: scan for i, scan in enumerate(self._remembered)}
+        others.pop(places[0].start, None)
+        if self._key is not None:
+            others[_KEY.start] = self._key
+        kept = list(others)[max(len(others) - self.remembered, 0) :]
+        self._remembered = [others[first] for first in kept]
         self._key, self._last = key, last
-        rows = np.concatenate([_ROWS[place] for place in (*places, _POSE)])
-        self._mean, self._covariance = self._mean[rows], self._covariance[np.ix_(rows, rows)]
+        self._select(*places, _POSE, *(slice(first, first + 3) for first in kept))
+        self._old = RememberedPoses(9, self._mean, self._covariance)
+        self._mean, self._covariance = self._mean[:9], self._covariance[:9, :9]
 
     def _own_noise(self, scan: PreparedScan) -> Array:
         """Shared noise (3, 3) in map of a scan that was not registered: from one against itself."""

@@ -46,6 +46,7 @@ _WIDTHS = {"tukey": 6.0, "huber": 1.345, "none": math.inf}
 _AGREEMENT = 6.0  # range standard deviations from a line of the other scan
 MIN_POINTS = 3  # of a scan that can be registered
 MIN_OVERLAP = 0.6  # share of the source's points that must agree with the target
+MIN_OVERLAP_OF_CURVES = 0.4  # of scans cut at jump edges: a turn takes a third out of view
 MIN_AGREEMENT = 0.5  # the same of those, in both scans, that bear on any one direction
 MIN_INFORMATION_RATIO = 4.0  # times the spurious information that the noise of the lines makes
 
@@ -253,7 +254,8 @@ def register(
     )
     pose[2] = math.remainder(pose[2], 2.0 * math.pi)
     status = "ok"
-    if np.count_nonzero(fit.weights) < MIN_OVERLAP * len(fit.weights):
+    min_overlap = MIN_OVERLAP_OF_CURVES if source.curves else MIN_OVERLAP
+    if np.count_nonzero(fit.weights) < min_overlap * len(fit.weights):
         status = "poor_overlap"
     elif not _positive_definite(information - MIN_INFORMATION_RATIO * spurious):
         status = "degenerate"

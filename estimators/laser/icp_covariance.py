@@ -26,6 +26,8 @@ from estimators.laser.icp import (
     prepare,
     register,
 )
+from estimators.laser.icp_iterations import distance
+from estimators.laser.scan_lines import Segments
 from sim import se2
 from sim.arrays import Array, Ints
 from sim.compiled import njit
@@ -33,6 +35,7 @@ from sim.compiled import njit
 Scans = Literal["both", "last"]
 Matches = Literal["held", "sliding"]
 
+_LEAST_MEMBERS = 3  # points on a line before their mean counts
 UNKNOWN_M, UNKNOWN_RAD = 10.0, math.pi  # standard deviations of an unconstrained direction
 
 
@@ -42,6 +45,22 @@ def _add_outer(matrix: Array, weight: float, v: tuple[float, float, float]) -> N
     for a in range(3):
         for b in range(3):
             matrix[a, b] += weight * v[a] * v[b]
+
+
+@njit(error_model="numpy")
+def _on_arc(
+    segments: Segments, j: int, x: float, y: float
+) -> tuple[float, float, float, float, float]:
+    """Normal of an arc near a point, and derivatives of the distance by its m and its bend."""
+    _, n1, n2 = distance(segments, j, x, y)
+    m1, m2, d = segments.normals[j, 0], segments.normals[j, 1], segments.distances_m[j]
+    facing, turned = (
+        n1 * m1 + n2 * m2,
+        n1 * y - n2 * x,
+    )  # as it moves outwards, and about the sensor
+    e1, e2 = d * d * facing * m1 - d * turned * m2, d * d * facing * m2 + d * turned * m1
+    u = m1 * y - m2 * x - segments.bends[j, 1]
+    return n1, n2, e1, e2, -facing * (u * u - segments.bends[j, 2])
 
 
 @njit(error_model="numpy")
@@ -57,8 +76,9 @@ def _censi(
     A, by_source, by_target = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
     cos, sin = math.cos(pose[2]), math.sin(pose[2])
     lines, information = target.lines, target.line_information
+    segments = target.segments
     # the source's points of one line (or target point) share its noise: sum before squaring
-    shared = np.zeros((len(lines) if to_lines else len(target.points), 6))
+    shared = np.zeros((len(lines) if to_lines else len(target.points), 9))
     for i in range(len(source.points)):
         w, j = weights[i], matches[i]
         if not w > 0.0:
@@ -72,6 +92,12 @@ def _censi(
             e = residuals[i]
             size = math.hypot(lines[j, 0], lines[j, 1])
             n1, n2 = lines[j, 0] / size, lines[j, 1] / size
+            # by the two numbers of the line, m: e = (m.p - 1) / |m|
+            e1, e2 = (x - e * n1) / size, (y - e * n2) / size
+            if segments.bends[j, 0] != 0.0:
+                n1, n2, e1, e2, by_bend = _on_arc(segments, j, x, y)
+                for a in range(3):
+                    shared[j, 6 + a] += w * (n1, n2, n2 * qx - n1 * qy)[a] * by_bend
             lever, turned = n2 * qx - n1 * qy, n1 * qx + n2 * qy
             J = (n1, n2, lever)
             A[2, 2] -= w * e * turned
@@ -79,8 +105,6 @@ def _censi(
             facing = n1 * vx + n2 * vy
             slide = w * e * (n2 * vx - n1 * vy)
             column = (w * facing * n1, w * facing * n2, w * facing * lever + slide)
-            # by the two numbers of the line, m: e = (m.p - 1) / |m|
-            e1, e2 = (x - e * n1) / size, (y - e * n2) / size
             t1, t2 = -n2, n1
             T = (t1, t2, turned)
             for a in range(3):
@@ -125,6 +149,9 @@ def _censi(
                 b1, b2 = shared[j, 2 * b], shared[j, 2 * b + 1]
                 form = s22 * a1 * b1 - s12 * (a1 * b2 + a2 * b1) + s11 * a2 * b2
                 by_target[a, b] += form / (s11 * s22 - s12 * s12)
+        if segments.bends[j, 0] != 0.0:
+            by = (shared[j, 6], shared[j, 7], shared[j, 8])
+            _add_outer(by_target, 1.0 / segments.bends[j, 3], by)
     return A, by_source, by_target
 
 
@@ -195,6 +222,34 @@ def censi(
         noise = target.noise_m if sigma_range_m is None else sigma_range_m
         middle += noise**2 * by_target
     return _sandwich(A, middle, registration, everywhere=everywhere)
+
+
+@njit(error_model="numpy")
+def misfit(
+    target: PreparedScan, matches: Ints, weights: Array, residuals: Array, n_lines: int
+) -> float:
+    """How many times its variance the mean residual of a line has, on average; at least 1.
+
+    Residuals of a line that are noise have a mean of zero; where they do not, the line is not what
+    both scans saw (a chord, a person, another object), which no noise of the ranges describes.
+    """
+    sums, moments = np.zeros(n_lines), np.zeros(n_lines)
+    n_source, n_target = np.zeros(n_lines), np.zeros(n_lines)
+    for line in target.line_of_point:
+        if line >= 0:
+            n_target[line] += 1.0
+    for i in range(len(matches)):
+        if weights[i] > 0.0:
+            sums[matches[i]] += weights[i]
+            moments[matches[i]] += weights[i] * residuals[i]
+            n_source[matches[i]] += 1.0
+    squares, counted = 0.0, -3.0  # the pose follows three of them
+    for line in range(n_lines):
+        if n_source[line] >= _LEAST_MEMBERS:
+            variance = (1.0 + n_source[line] / max(n_target[line], 1.0)) * sums[line]
+            squares += moments[line] * moments[line] / variance
+            counted += 1.0
+    return max(squares / counted, 1.0) if counted >= 1.0 else 1.0
 
 
 def hessian(registration: Registration) -> Array:
@@ -328,8 +383,12 @@ def _without_noise(scan: PreparedScan) -> Array:
     """Ranges (N,) of all beams, those on a line put onto it; +inf for beams that saw nothing."""
     ranges, on = np.full(len(scan.bearings_rad), np.inf), scan.line_of_point >= 0
     ranges[scan.beams] = scan.ranges_m
-    inverse = np.sum(scan.lines[scan.line_of_point[on]] * scan.rays[on], axis=1)
+    line, bends = scan.line_of_point[on], scan.segments.bends
+    inverse = np.sum(scan.lines[line] * scan.rays[on], axis=1)
     ranges[scan.beams[on]] = 1.0 / inverse
+    for i in np.flatnonzero(on)[bends[line, 0] != 0.0]:
+        off, *normal = distance(scan.segments, scan.line_of_point[i], *scan.points[i])
+        ranges[scan.beams[i]] = scan.ranges_m[i] - off / max(normal @ scan.rays[i], 0.1)
     return ranges
 
 

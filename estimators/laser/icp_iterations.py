@@ -115,9 +115,27 @@ def rotate(cos: float, sin: float, x: float, y: float) -> tuple[float, float]:
 
 @njit(forceinline=True, error_model="numpy", fastmath={"contract"})
 def off_line(surface: Segments, k: int, x: float, y: float) -> float:
-    """Signed distance of a point from the line of segment k."""
-    off: float = surface.normals[k, 0] * x + surface.normals[k, 1] * y - surface.distances_m[k]
-    return off
+    """Signed distance of a point from the line or arc of segment k."""
+    return distance(surface, k, x, y)[0]
+
+
+@njit(forceinline=True, error_model="numpy", fastmath={"contract"})
+def distance(surface: Segments, k: int, x: float, y: float) -> tuple[float, float, float]:
+    """Signed distance of a point from the line or arc of segment k, and the normal there.
+
+    Beyond its ends an arc is taken to go on as its line does.
+    """
+    n1, n2 = surface.normals[k, 0], surface.normals[k, 1]
+    off = n1 * x + n2 * y - surface.distances_m[k]
+    bend = surface.bends[k, 0]
+    if bend != 0.0:
+        along = min(max(n1 * y - n2 * x, surface.spans_m[k, 0]), surface.spans_m[k, 1])
+        u = along - surface.bends[k, 1]
+        slope = 2.0 * bend * u
+        scale = 1.0 / math.sqrt(1.0 + slope * slope)
+        off = (off - bend * (u * u - surface.bends[k, 2])) * scale
+        n1, n2 = (n1 + slope * n2) * scale, (n2 - slope * n1) * scale
+    return off, n1, n2
 
 
 @njit(forceinline=True, error_model="numpy", fastmath={"contract"})
@@ -273,9 +291,8 @@ def _linearise(
             continue
         qx, qy = rotate(cos, sin, source.points[i, 0], source.points[i, 1])
         if pair.along_normals:
-            n1, n2 = planes.normals[j, 0], planes.normals[j, 1]
+            miss, n1, n2 = distance(planes, j, qx + pose[0], qy + pose[1])
             vx, vy = rotate(cos, sin, source.rays[i, 0], source.rays[i, 1])
-            miss = off_line(planes, j, qx + pose[0], qy + pose[1])
             variance = pair.noise_m * pair.noise_m
             if pair.whole_lines:
                 variance = variance_along(n1, n2, vx, vy, pair.noise_m)

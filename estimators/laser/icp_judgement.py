@@ -9,6 +9,7 @@ from estimators.laser.icp_iterations import (
     Pair,
     add_line,
     add_point,
+    distance,
     off_line,
     rotate,
     variance_along,
@@ -42,13 +43,13 @@ def judge(pair: Pair, pose: Array, fit: Fit) -> tuple[Array, Array, Array]:
             continue
         qx, qy = rotate(cos, sin, source.points[i, 0], source.points[i, 1])
         if pair.along_normals:
-            n1, n2 = pair.planes.normals[fit.matches[i], 0], pair.planes.normals[fit.matches[i], 1]
+            _, n1, n2 = distance(pair.planes, fit.matches[i], qx + pose[0], qy + pose[1])
             add_line(normal, weight, n1, n2, qx, qy)
         else:
             add_point(normal, weight, qx, qy)
         if line < 0:
             continue
-        n1, n2 = segments.normals[line, 0], segments.normals[line, 1]
+        _, n1, n2 = distance(segments, line, qx + pose[0], qy + pose[1])
         if not pair.whole_lines:
             vx, vy = rotate(cos, sin, source.rays[i, 0], source.rays[i, 1])
             weight = 1.0 / variance_along(n1, n2, vx, vy, pair.noise_m)

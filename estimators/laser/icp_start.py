@@ -17,7 +17,7 @@ def as_segments(scan: PreparedScan) -> Segments:
     """The points of a scan as segments without length."""
     n, (x, y) = len(scan.points), scan.points.T.copy()
     spans, end_rays = np.stack([y, y], axis=1), np.stack([scan.rays, scan.rays], axis=1)
-    return Segments(np.tile([1.0, 0.0], (n, 1)), x, spans, end_rays, np.zeros(n))
+    return Segments(np.tile([1.0, 0.0], (n, 1)), x, spans, end_rays, np.zeros(n), np.zeros((n, 4)))
 
 
 class Planes(NamedTuple):

@@ -14,12 +14,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from estimators.laser.scan_arcs import join_arcs
 from sim.arrays import Array, Ints
 from sim.compiled import njit
 from sim.errors import require
 
 _NOISE_FLOOR_M = 0.002  # quantised ranges can look free of noise
 _MEDIAN_OF_NORMAL = 0.6745  # median of |z|, z ~ N(0, 1)
+_QUARTER_OF_NORMAL = 0.3186  # lower quartile of |z|
+_SMOOTH_BENDS = 5.0  # standard deviations beyond which a second difference is a jump's
 _LEAST_BENDS = 10  # second differences from which a noise can be told
 _STEEPEST = 0.5  # measured over expected range; below, a beam runs nearly along its line
 _MOST_GROWTH = 0.3  # of 1 / range at a line's end: a wall may go on 3.3 times as far
@@ -31,6 +34,8 @@ _FIT_GATE = 3.5  # standard deviations by which the next point may miss its line
 _DRIFT_GATE = 3.0  # the same for the mean of the last points: where a wall bends slowly
 _DRIFT_POINTS = 8
 _MOST_SKIPPED = 1  # points in a row that miss the line before it ends
+_MOST_STRETCH = 3.0  # of the gap between neighbours on a line, beyond noise: farther, it is a jump
+_GAP_NOISE = 8.0  # standard deviations of the ranges by which gaps may differ
 # Cutting neighbours again: how many points each may give to the other
 _GIVEN_ON, _GIVEN_BACK = 12, 6
 _RECUT_GATE = 4.0  # standard deviations by which a point may miss the line that it is given to
@@ -55,6 +60,9 @@ class Segments(NamedTuple):
         (L, 2, 2) unit vectors to start and end.
     direction_variances
         (L,) rad^2.
+    bends
+        (L, 4) b, c, s of an arc (`estimators.laser.scan_arcs`), 1/m, m, m^2, and the information
+        about b under unit range noise; b is 0 for a straight line.
     """
 
     normals: Array
@@ -62,6 +70,7 @@ class Segments(NamedTuple):
     spans_m: Array
     end_rays: Array
     direction_variances: Array
+    bends: Array
 
 
 class PreparedScan(NamedTuple):
@@ -89,6 +98,8 @@ class PreparedScan(NamedTuple):
         Standard deviation of the ranges about straight walls, measured in the scan itself.
     full_circle
         Whether the last beam is the neighbour of the first.
+    curves
+        Whether it is cut at jump edges, and chords are joined to arcs: see `prepare`.
     """
 
     bearings_rad: Array
@@ -103,10 +114,15 @@ class PreparedScan(NamedTuple):
     segments: Segments
     noise_m: float
     full_circle: bool
+    curves: bool
 
 
 def prepare(
-    ranges_m: ArrayLike, bearings_rad: ArrayLike, max_range_m: float = math.inf
+    ranges_m: ArrayLike,
+    bearings_rad: ArrayLike,
+    max_range_m: float = math.inf,
+    *,
+    curves: bool = False,
 ) -> PreparedScan:
     """Points, straight pieces and noise of a scan.
 
@@ -118,6 +134,9 @@ def prepare(
         (N,) beam angles in the sensor frame, rising, over at most a full circle.
     max_range_m
         The laser's; a beam of just that range saw nothing.
+    curves
+        Cut at jump edges, and join chords of a curve to arcs. Without it a piece is what fits a
+        line, as the reproduced papers have it.
     """
     ranges = np.ascontiguousarray(ranges_m, dtype=np.float64)
     bearings = np.ascontiguousarray(bearings_rad, dtype=np.float64)
@@ -133,7 +152,7 @@ def prepare(
         )
         full = bool(bearings[-1] - bearings[0] + 1.5 * steps[0] > 2.0 * math.pi)
     most_m = min(max_range_m, float(np.float32(max_range_m)))  # ranges may have been 32 bits
-    return _prepare(ranges, bearings, float(most_m), full)
+    return _prepare(ranges, bearings, float(most_m), full, curves)
 
 
 def without_sparse_lines(scan: PreparedScan, max_gap_m: float) -> PreparedScan:
@@ -179,10 +198,11 @@ def select(values: Array, rank: int) -> float:
 
 
 @njit(error_model="numpy", fastmath={"contract"})
-def _noise(ranges: Array, rays: Array, beams: Ints) -> float:
+def _noise(ranges: Array, rays: Array, beams: Ints, jumps: bool) -> float:
     """Standard deviation of the ranges, from second differences of 1 / range.
 
-    On a straight wall u[i-1] - 2 cos(step) u[i] + u[i+1] is zero for u = 1 / range.
+    On a straight wall u[i-1] - 2 cos(step) u[i] + u[i+1] is zero for u = 1 / range. With `jumps`
+    those far above the lower quartile are left out: among chair legs most span an edge.
     """
     found = np.empty(max(len(ranges), 1))
     n = 0
@@ -196,6 +216,10 @@ def _noise(ranges: Array, rays: Array, beams: Ints) -> float:
         n += 1
     if n < _LEAST_BENDS:
         return _NOISE_FLOOR_M
+    if jumps:
+        most = _SMOOTH_BENDS * select(found[:n], n // 4) / _QUARTER_OF_NORMAL
+        smooth = found[:n][found[:n] <= most]
+        return max(select(smooth, len(smooth) // 2) / _MEDIAN_OF_NORMAL, _NOISE_FLOOR_M)
     return max(select(found[:n], n // 2) / _MEDIAN_OF_NORMAL, _NOISE_FLOOR_M)
 
 
@@ -231,8 +255,9 @@ def _miss(m1: float, m2: float, u: float, v: float, r: float) -> float:
 
 @njit(error_model="numpy", fastmath={"contract"})
 def _grown(
-    ranges: Array, rays: Array, noise: float, first: int, number: int, line_of_point: Ints
-) -> tuple[int, int, float, float, float]:
+    ranges: Array, rays: Array, noise: float, first: int, number: int, line_of_point: Ints,
+    jumps: bool,
+) -> tuple[int, int, float, float, float]:  # fmt: skip
     """Number the points of the line that begins at a point.
 
     By recursive least squares of 1 / range = m.v with weights range^4 / noise^2.
@@ -245,12 +270,18 @@ def _grown(
     sums = (0.0, 0.0, 0.0, 0.0, 0.0)
     recent, drift = np.zeros(_DRIFT_POINTS), 0.0  # the last misses, and their sum
     last, count = first, 0
+    x, y, gap, slack = 0.0, 0.0, 0.0, _GAP_NOISE * noise  # the last point, and from that before it
     for i in range(first, len(ranges)):
         if i - last > _MOST_SKIPPED + 1:
             break
         u, v, r = rays[i, 0], rays[i, 1], ranges[i]
         weight = r**4
+        step = math.hypot(r * u - x, r * v - y) / max(i - last, 1)
         if count >= 2:
+            if jumps and step > _MOST_STRETCH * gap + slack:
+                continue
+            if jumps and count == 2 and gap > _MOST_STRETCH * step + slack:
+                break
             m1, m2, determinant = _solved(sums)
             leverage = weight * _form(sums[2], -sums[1], sums[0], u, v) / determinant
             miss = _miss(m1, m2, u, v, r) / (noise * math.sqrt(1.0 + leverage))
@@ -261,13 +292,14 @@ def _grown(
             recent[count % _DRIFT_POINTS] = miss
         line_of_point[i] = number
         sums = _added(sums, weight, r**3, u, v)
+        x, y, gap = r * u, r * v, step
         last, count = i, count + 1
     m1, m2, determinant = _solved(sums)
     return last, count, m1, m2, determinant
 
 
 @njit(error_model="numpy", fastmath={"contract"})
-def _grow(ranges: Array, rays: Array, noise: float) -> tuple[Ints, Array, Ints]:
+def _grow(ranges: Array, rays: Array, noise: float, jumps: bool) -> tuple[Ints, Array, Ints]:
     """Lines from left to right, each as long as it goes: line of each point, lines, ends."""
     line_of_point = np.full(len(ranges), -1)
     lines = np.zeros((len(ranges) // _MIN_LINE_POINTS + 1, 2))
@@ -275,7 +307,7 @@ def _grow(ranges: Array, rays: Array, noise: float) -> tuple[Ints, Array, Ints]:
     n_lines = first = 0
     while first < len(ranges):
         last, count, m1, m2, determinant = _grown(
-            ranges, rays, noise, first, n_lines, line_of_point
+            ranges, rays, noise, first, n_lines, line_of_point, jumps
         )
         if count < _MIN_LINE_POINTS or determinant <= 0.0:
             line_of_point[first : last + 1] = -1
@@ -369,13 +401,15 @@ def _merge(
 
 @njit(error_model="numpy", fastmath={"contract"})
 def _describe(
-    lines: Array, information: Array, ends: Ints, rays: Array, beams: Ints, spacing: float,
-    noise: float,
+    lines: Array, information: Array, ends: Ints, bends: Array, ranges: Array, rays: Array,
+    beams: Ints, errors: tuple[float, float],
 ) -> Segments:  # fmt: skip
-    """The lines as segments."""
+    """The lines as segments; `errors` are the spacing of the beams, rad, and their noise, m."""
+    spacing, noise = errors
     n = len(lines)
     normals, distances, spans = np.empty((n, 2)), np.empty(n), np.empty((n, 2))
     end_rays, variances = np.empty((n, 2, 2)), np.empty(n)
+    tangents = np.empty((n, 2))  # directions of the normals at both ends
     cos, sin = math.cos(spacing), math.sin(spacing)
     for k in range(n):
         m1, m2 = lines[k, 0], lines[k, 1]
@@ -391,24 +425,34 @@ def _describe(
                 m1 * u + m2 * v, _MOST_GROWTH * (m1 * a + m2 * b)
             )
             end_rays[k, side, 0], end_rays[k, side, 1] = u, v
+            tangents[k, side] = math.atan2(n2, n1)
+            if bends[k, 0] != 0.0:
+                r = ranges[ends[k, side]]
+                at, out = r * (b * n1 - a * n2), 2.0 * side - 1.0
+                slope = 2.0 * bends[k, 0] * (at - bends[k, 1])
+                facing = max(a * n1 + b * n2 - slope * (b * n1 - a * n2), _MOST_GROWTH)
+                spans[k, side] = at + out * r * spacing / facing
+                tangents[k, side] -= math.atan(slope)
         s11, s12, s22 = information[k, 0], information[k, 1], information[k, 2]
         # variance of m across itself, as an angle: covariance of m is noise^2 S^-1
         across = _form(s11, s12, s22, n1, n2) / (s11 * s22 - s12 * s12)
         variances[k] = noise * noise * across / (size * size)
     # a piece that meets its neighbour at a small angle may be a chord of a curve
     for k in range(1, n):
-        a, b = normals[k - 1], normals[k]
-        angle = abs(math.atan2(a[0] * b[1] - a[1] * b[0], a[0] * b[0] + a[1] * b[1]))
+        angle = tangents[k, 0] - tangents[k - 1, 1]
+        angle = abs(angle - 2.0 * math.pi * round(angle / (2.0 * math.pi)))
         adjacent = beams[ends[k, 0]] - beams[ends[k - 1, 1]] <= _ADJACENT_BEAMS
         if adjacent and angle < _SMOOTH_JOINT_RAD:
             spread = angle * angle / 12.0  # variance of a direction anywhere between the two
             variances[k - 1] += spread
             variances[k] += spread
-    return Segments(normals, distances, spans, end_rays, variances)
+    return Segments(normals, distances, spans, end_rays, variances, bends)
 
 
 @njit(error_model="numpy", fastmath={"contract"})
-def _prepare(ranges: Array, bearings: Array, max_range: float, full_circle: bool) -> PreparedScan:
+def _prepare(
+    ranges: Array, bearings: Array, max_range: float, full_circle: bool, curves: bool
+) -> PreparedScan:
     beams = np.flatnonzero((ranges > 0.0) & (ranges < max_range))
     rays, points = np.empty((len(beams), 2)), np.empty((len(beams), 2))
     for k in range(len(beams)):
@@ -416,13 +460,18 @@ def _prepare(ranges: Array, bearings: Array, max_range: float, full_circle: bool
         rays[k, 0], rays[k, 1] = math.cos(bearings[i]), math.sin(bearings[i])
         points[k, 0], points[k, 1] = ranges[i] * rays[k, 0], ranges[i] * rays[k, 1]
     seen_m = ranges[beams]
-    noise = _noise(seen_m, rays, beams)
-    line_of_point, lines, ends = _grow(seen_m, rays, noise)
+    noise = _noise(seen_m, rays, beams, curves)
+    line_of_point, lines, ends = _grow(seen_m, rays, noise, curves)
     _recut(seen_m, rays, noise, line_of_point, lines, ends)
     lines, information, ends = _merge(seen_m, rays, beams, noise, line_of_point, lines, ends)
+    bends = np.zeros((len(lines), 4))
+    if curves:
+        lines, information, ends, bends = join_arcs(
+            seen_m, rays, beams, noise, line_of_point, lines, information, ends
+        )
     spacing = bearings[1] - bearings[0] if len(bearings) > 1 else 0.0
-    segments = _describe(lines, information, ends, rays, beams, spacing, noise)
+    segments = _describe(lines, information, ends, bends, seen_m, rays, beams, (spacing, noise))
     return PreparedScan(
         bearings, seen_m, rays, points, beams, line_of_point, lines, information, ends, segments,
-        noise, full_circle,
+        noise, full_circle, curves,
     )  # fmt: skip

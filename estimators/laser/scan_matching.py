@@ -28,6 +28,7 @@ from estimators.laser.icp import (
     prepare,
     register,
 )
+from estimators.laser.remembered import seen_again
 from estimators.laser.scan_lines import without_sparse_lines
 from sim import se2
 from sim.arrays import Array
@@ -154,9 +155,16 @@ class ScanMatcher:
         """Which matches count, and when iterations end."""
         return self.believed if isinstance(self.believed, Rules) else DEFAULT_RULES
 
+    @property
+    def curves(self) -> bool:
+        """Whether scans are cut into lines and arcs, as the metric that matches them needs it."""
+        return self.believed.metric == "point_to_line"
+
     def prepare(self, ranges_m: ArrayLike, laser: Laser) -> PreparedScan | None:
         """Prepare a scan of this laser; None if it shows too little to be registered."""
-        scan = prepare(ranges_m, laser.bearings_rad, laser.max_range_m)
+        scan = prepare(ranges_m, laser.bearings_rad, laser.max_range_m, curves=self.curves)
+        if self.curves:  # coarse ranges look free of noise
+            scan = scan._replace(noise_m=max(scan.noise_m, self.sigma_m(laser)))
         if self.max_gap_m is not None:
             scan = without_sparse_lines(scan, self.max_gap_m)
         return scan if len(scan.points) >= MIN_POINTS else None
@@ -218,6 +226,14 @@ class ScanMatcher:
         covariance = motion.covariance + leak * match.known_covariance
         return dataclasses.replace(match, motion=Gaussian(motion.mean, covariance))
 
+    def seen_again(
+        self, scan: PreparedScan, other: PreparedScan, pose: Array, laser: Laser
+    ) -> float:
+        """Share of a scan's points that another scan should show, by T_other_scan of base_link."""
+        mount = laser.mount.pose
+        in_laser = se2.compose(se2.compose(se2.inverse(mount), pose), mount)
+        return seen_again(scan, other, in_laser)
+
     def sigma_m(self, laser: Laser) -> float:
         """Believed range noise, m."""
         sigma = self.believed.sigma_range_m
@@ -241,4 +257,10 @@ class ScanMatcher:
                 found, source, target, of_guess, sigma_m, matches="sliding", rules=self.rules
             )
         scans: icp_covariance.Scans = "last" if self.believed.covariance == "censi_last" else "both"
+        if self.curves:
+            noise_m = max(source.noise_m, target.noise_m)
+            scale = icp_covariance.misfit(
+                target, found.matches, found.weights, found.residuals_m, len(target.lines)
+            )
+            sigma_m = max(sigma_m, noise_m * math.sqrt(scale))
         return icp_covariance.censi(found, source, target, sigma_m, scans=scans, matches="sliding")

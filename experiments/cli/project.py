@@ -99,7 +99,7 @@ def bench(
         str,
         typer.Argument(
             help="compile, external, fastslam, formats, graph_slam, growth, icp, mcl, sim, "
-            "smoothing, sweep, sweep_scale, teams, topological, or all."
+            "smoothing, sweep, sweep_scale, teams, topological, worlds, or all."
         ),
     ] = "all",
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,

@@ -124,7 +124,7 @@ def test_the_walk_finds_the_nearest(rng):
             near, squared = icp_iterations.nearest(as_segments, full, start, x, y)
             assert squared == pytest.approx(tree.query([x, y])[0] ** 2)
             assert squared == pytest.approx(np.sum((target.points[near] - (x, y)) ** 2))
-            normals, distances, spans, _, _ = target.segments
+            normals, distances, spans, *_ = target.segments
             along = normals[:, 0] * y - normals[:, 1] * x
             over = np.maximum(spans[:, 0] - along, along - spans[:, 1])
             squares = (normals @ (x, y) - distances) ** 2 + np.maximum(over, 0.0) ** 2

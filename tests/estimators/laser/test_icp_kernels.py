@@ -85,7 +85,7 @@ def test_a_line_grows_as_far_as_all_its_points_allow(scans):
                 misses.append(miss)
             own.append(i)
         line_of_point = np.full(len(r), -1)
-        last, count, *m, _ = scan_lines._grown(r, rays, noise, first, 5, line_of_point)
+        last, count, *m, _ = scan_lines._grown(r, rays, noise, first, 5, line_of_point, False)
         assert (last, count) == (own[-1], len(own))
         assert np.array_equal(np.flatnonzero(line_of_point == 5), own)
         A = r[own, None] ** 2 * rays[own]
@@ -94,7 +94,7 @@ def test_a_line_grows_as_far_as_all_its_points_allow(scans):
 
 def test_neighbours_are_cut_where_both_fit_best(scans):
     r, rays, noise = scans[0].ranges_m, scans[0].rays, scans[0].noise_m
-    line_of_point, lines, ends = scan_lines._grow(r, rays, noise)
+    line_of_point, lines, ends = scan_lines._grow(r, rays, noise, False)
     before = ends.copy()
     scan_lines._recut(r, rays, noise, line_of_point, lines, ends)
     moved = 0
@@ -150,7 +150,8 @@ def test_a_wall_in_two_pieces_is_merged_by_their_information():
 
 def test_segments_end_at_the_next_beams(scans):
     scan = scans[0]
-    normals, distances, spans, end_rays, variances = scan.segments
+    normals, distances, spans, end_rays, variances, bends = scan.segments
+    assert not bends.any()
     np.testing.assert_allclose(distances[:, None] * scan.lines, normals, atol=1e-12)
     along = np.column_stack([-normals[:, 1], normals[:, 0]])
     step = BEARINGS_RAD[1] - BEARINGS_RAD[0]

@@ -41,21 +41,21 @@ def test_lines_grow_one_after_another(scans):
     expected, lines, ends, first = np.full(len(r), -1), [], [], 0
     while first < len(r):
         trial = np.full(len(r), -1)
-        last, count, *line, determinant = scan_lines._grown(r, rays, noise, first, 0, trial)
+        last, count, *line, determinant = scan_lines._grown(r, rays, noise, first, 0, trial, False)
         if count >= 3 and determinant > 0.0:
             expected[trial == 0] = len(lines)
             lines.append(line)
             ends.append([first, last])
             first = last
         first += 1
-    found = scan_lines._grow(r, rays, noise)
+    found = scan_lines._grow(r, rays, noise, False)
     for one, other in zip(found, (expected, lines, ends), strict=True):
         np.testing.assert_array_equal(one, other)
 
 
 def test_neighbours_are_merged_if_one_line_fits_both(scans):
     r, rays, noise = scans[0].ranges_m, scans[0].rays, scans[0].noise_m
-    of_point, lines, ends = scan_lines._grow(r, rays, noise)
+    of_point, lines, ends = scan_lines._grow(r, rays, noise, False)
     scan_lines._recut(r, rays, noise, of_point, lines, ends)
     walls = []  # own points, m, information
     for k, (first, last) in enumerate(ends):
@@ -85,7 +85,7 @@ def test_direction_variances_grow_at_joints_of_a_curve():
     bearings = np.linspace(-1.0, 1.0, 201)
     curve = 2.0 * np.cos(bearings) + np.sqrt(9.0 - 4.0 * np.sin(bearings) ** 2)  # about (2, 0)
     scan = prepare(curve + 0.005 * np.random.default_rng(1).standard_normal(201), bearings)
-    normals, distances, *_, variances = scan.segments
+    normals, distances, *_, variances, _ = scan.segments
     along = np.column_stack([-normals[:, 1], normals[:, 0]])
     S = scan.line_information[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
     across = np.einsum("ki,kij,kj->k", along, np.linalg.inv(S), along)
