@@ -1,11 +1,12 @@
-"""Closing loops with a laser: which key frames to compare, and which closures to believe.
+"""Closing loops with a laser: which places to compare, and which closures to believe.
 
-A key frame is compared with an older one where the uncertainty of their relative pose lets the two
-see the same place (a Mahalanobis gate), where that would teach something (the information gain of
-ila2010), and where the scans look alike. The scans are registered from several starts, which must
-agree. A closure is held until enough others agree with it: the joint innovation of each pair must
-pass a chi-squared test (joint compatibility, neira2001; the largest set of pairwise consistent
-closures, mangelson2018).
+Where the graph knows a key frame's pose by an older one to some decimetres, their scans are
+registered. Where it does not, all old places within its uncertainty are compared with the new
+path's last metres (`estimators.graph.place_search`), and the best must be well ahead of any other.
+Only what would teach something counts (the information gain of ila2010). A closure is held until
+enough others agree with it, over the more metres of new path the less is known: the joint
+innovation of each pair must pass a chi-squared test (joint compatibility, neira2001; the largest
+set of pairwise consistent closures, mangelson2018).
 
 Sources: Ila, Porta and Andrade-Cetto, Information-based compact pose SLAM, T-RO 26, 2010; Neira and
 Tardos, Data association in stochastic mapping using the joint compatibility test, T-RA 17, 2001;
@@ -23,6 +24,7 @@ from pydantic import Field
 from scipy.special import chdtri
 
 from estimators.gaussian import Gaussian
+from estimators.graph.place_search import Patch, Place, agreement, find_places, make_patch
 from estimators.graph.pose_graph import Edge, PoseGraph
 from estimators.laser.icp import PreparedScan
 from estimators.laser.scan_matching import ScanMatcher
@@ -31,15 +33,16 @@ from sim.arrays import Array, Ints
 from sim.options import Count, NonNegative, Positive, options
 from sim.sensors import Laser
 
-N_QUANTILES = 16
-_QUANTILES = np.linspace(0.03, 0.97, N_QUANTILES)
-_ALIKE = 0.5  # mean difference of log quantiles; scans of one place differ less
 _REACH_SIGMAS = 3.0
-_START_M, _START_RAD, _MOST_STEPS = 0.5, 0.06, 3  # between starts, and their number either way
-_START = np.diag([(_START_M / 2.0) ** 2, (_START_M / 2.0) ** 2, _START_RAD**2])
-_MOST_TURN_RAD = 0.5  # of a start's heading from the expected one
-_SAME_M, _SAME_RAD = 0.1, 0.03  # results of two starts that differ by less are one
-_RIVAL = 0.9  # another result with this share of the best one's overlap makes it ambiguous
+_CERTAIN_M, _CERTAIN_RAD = 0.6, 0.2  # up to these, at three sigma, scans are registered at once
+_OLD_M, _NEW_M = 3.0, 5.0  # path of a patch: either way of an old key frame, and behind a new one
+_EVERY_M = 1.0  # of new path, places are looked for; of old path, one is compared
+_MIN_FIT = 0.45  # share of a patch's points that must lie on walls of the other
+_MIN_AGREEMENT, _MIN_SEEN = 0.75, 0.4  # of what both could see; and how much that must be
+_AHEAD = 0.9  # the second best place must have less than this share of the best one's score
+_KEPT_PATCHES = 60
+_NEIGHBOURS = 8  # key frames either way
+_SAME_M, _SAME_RAD = 0.15, 0.05  # closures that miss the graph alike
 
 
 @options("estimator")
@@ -52,10 +55,71 @@ class LoopOptions:
     """A closure is refused if only this share of all right ones misses the graph by more."""
     loop_min_gain: NonNegative = 2.0
     """Information about the relative pose that a closure must add online, nats."""
-    loop_candidates: Count = 5
+    loop_candidates: Count = 2
     """Older key frames that a new one is registered with, at most."""
     loop_support: Count = 3
     """Closures of the last 15 key frames that must be consistent before any is believed."""
+    loop_support_m: NonNegative = 4.0
+    """New path over which closures must agree where the graph knew the place badly, m."""
+
+
+@dataclass(frozen=True)
+class Seen:
+    """A key frame: its scan, and how far the robot had driven by then, m."""
+
+    scan: PreparedScan | None
+    driven_m: float
+
+
+class Patches:
+    """Patches of the path, drawn when they are asked for.
+
+    Attributes
+    ----------
+    key_frames
+        Of all nodes of the graph.
+    """
+
+    def __init__(self, mount: Array) -> None:
+        self.key_frames: list[Seen] = []
+        self._mount = mount
+        self._drawn: dict[int, Patch] = {}
+
+    @property
+    def driven_m(self) -> Array:
+        """(N,) way to each node."""
+        return np.array([seen.driven_m for seen in self.key_frames])
+
+    def anchors(self) -> Ints:
+        """Old key frames with a patch, `_EVERY_M` apart."""
+        driven_m = self.driven_m
+        inside = driven_m < driven_m[-1] - _OLD_M - _NEW_M
+        steps = np.floor(driven_m / _EVERY_M)
+        return np.flatnonzero(inside & (np.diff(steps, prepend=-1.0) > 0.0))
+
+    def old(self, graph: PoseGraph, node: int) -> Patch:
+        """What was seen about an old key frame."""
+        if node not in self._drawn:
+            if len(self._drawn) >= _KEPT_PATCHES:
+                del self._drawn[next(iter(self._drawn))]
+            self._drawn[node] = self._draw(graph, node, _OLD_M, _OLD_M)
+        return self._drawn[node]
+
+    def new(self, graph: PoseGraph, node: int) -> Patch:
+        """What was seen on the way to a key frame."""
+        return self._draw(graph, node, _NEW_M, 0.0)
+
+    def forget(self) -> None:
+        """Draw patches again: the graph has moved."""
+        self._drawn.clear()
+
+    def _draw(self, graph: PoseGraph, node: int, back_m: float, ahead_m: float) -> Patch:
+        driven_m = self.driven_m - self.key_frames[node].driven_m
+        members = np.flatnonzero((driven_m >= -back_m) & (driven_m <= ahead_m))
+        members = [i for i in members.tolist() if self.key_frames[i].scan is not None]
+        poses = se2.between(graph.poses[node], graph.poses[members])
+        seen = [scan.points for i in members if (scan := self.key_frames[i].scan) is not None]
+        return make_patch(poses.reshape(-1, 3), seen, self._mount)
 
 
 @dataclass(frozen=True)
@@ -74,23 +138,19 @@ class LoopSearch:
     laser: Laser
     how: LoopOptions
 
-    def candidates(self, means: Array, covariances: Array, alike: NDArray[np.bool_]) -> Ints:
+    def candidates(self, means: Array, covariances: Array) -> Ints:
         """Those of K relative poses that may close a loop, the nearest first.
 
         Parameters
         ----------
         means, covariances
             (K, 3), (K, 3, 3): a scan in the frame of each of K others, as believed.
-        alike
-            (K,) whether the scans look alike.
         """
         away_m, turn = np.hypot(means[:, 0], means[:, 1]), np.abs(means[:, 2])
-        spread_m = np.linalg.eigvalsh(covariances[:, :2, :2])[:, 1]
-        sigma_m, sigma_rad = np.sqrt(np.maximum([spread_m, covariances[:, 2, 2]], 0.0))
+        sigma_m, sigma_rad = spreads(covariances)
         widest = self.laser.fov_rad / 2.0  # at more, two views share less than half
         near = away_m - _REACH_SIGMAS * sigma_m < self.how.loop_reach_m
-        facing = turn - _REACH_SIGMAS * sigma_rad < widest
-        chosen = np.flatnonzero(near & facing & alike)
+        chosen = np.flatnonzero(near & (turn - _REACH_SIGMAS * sigma_rad < widest))
         order = np.argsort((away_m / self.how.loop_reach_m + turn / widest)[chosen], kind="stable")
         return np.asarray(chosen[order])
 
@@ -99,24 +159,58 @@ class LoopSearch:
         gain = np.linalg.slogdet(noise + covariance)[1] - np.linalg.slogdet(noise)[1]
         return bool(gain / 2.0 >= self.how.loop_min_gain)
 
-    def register(
-        self, scan: PreparedScan, other: PreparedScan, expected: Gaussian, rng: np.random.Generator
-    ) -> Gaussian | None:
-        """Pose of a scan in the frame of another, from several starts; None if they disagree."""
-        found = [
-            self.matcher.match(scan, other, Gaussian(start, _START), self.laser, rng)
-            for start in _starts(expected)
-        ]
-        found = [match for match in found if not match.failed]
+    def find_place(
+        self, graph: PoseGraph, patches: Patches, node: int, anchors: Ints
+    ) -> tuple[int, Place] | None:
+        """The old place, of all within the uncertainty, where the newest key frame is.
+
+        None if there is none, or two that differ explain the last metres about as well.
+
+        Returns
+        -------
+        tuple
+            The old key frame, and the newest in its frame.
+        """
+        motions, covariances = graph.newest_from(anchors, exact=True)
+        new = patches.new(graph, node)
+        found: list[tuple[float, int, Array]] = []
+        for anchor, mean, P in zip(anchors.tolist(), motions, covariances, strict=True):
+            expected = Gaussian(mean, P + np.diag([0.01, 0.01, 1e-4]))
+            old = patches.old(graph, anchor)
+            for place in find_places(new, old, expected, self.how.loop_reach_m, _MIN_FIT):
+                fitting, seen = agreement(new, old, place.pose)
+                if fitting > _MIN_AGREEMENT and seen > _MIN_SEEN:
+                    found.append((place.score * fitting, anchor, place.pose))
         if not found:
             return None
-        best = max(found, key=lambda match: match.overlap)
-        for match in found:
-            x, y, turn = se2.between(best.motion.mean, match.motion.mean).tolist()
-            same = math.hypot(x, y) < _SAME_M and abs(turn) < _SAME_RAD
-            if not same and best.status == "ok" and match.overlap > _RIVAL * best.overlap:
-                return None
-        return best.motion
+        score, anchor, pose = max(found, key=lambda one: one[0])
+        at = se2.compose(graph.poses[anchor], pose)
+        for rival, other, its_pose in found:
+            if rival > _AHEAD * score:
+                off = se2.between(at, se2.compose(graph.poses[other], its_pose))
+                if math.hypot(off[0], off[1]) > 1.0 or abs(off[2]) > 0.3:
+                    return None
+        return anchor, Place(pose, score)
+
+    def fits(self, new: Patch, old: Patch, pose: Array) -> tuple[float, float]:
+        """Share of points that fit, of those that either patch sees, and share that is seen."""
+        return agreement(new, old, pose)
+
+    def supported(self, graph: PoseGraph, among: list[Edge], edges: list[Edge]) -> list[Edge]:
+        """Those edges that miss the graph by as much as others do, with both ends near theirs."""
+        first, second = np.array([(e.first, e.second) for e in among], int).reshape(-1, 2).T
+        measured = np.reshape([e.motion.mean for e in among], (-1, 3))
+        ends = se2.compose(graph.poses[first], measured)
+        off = se2.difference(ends, graph.poses[second])
+        kept = []
+        for k in range(len(among) - len(edges), len(among)):
+            near = np.abs(first - first[k]) <= _NEIGHBOURS
+            near &= (np.abs(second - second[k]) <= _NEIGHBOURS) & (second != second[k])
+            apart = se2.difference(off, off[k])
+            same = np.hypot(apart[:, 0], apart[:, 1]) < _SAME_M
+            if np.any(near & same & (np.abs(apart[:, 2]) < _SAME_RAD)):
+                kept.append(among[k])
+        return kept
 
     def consistent(self, graph: PoseGraph, edges: list[Edge]) -> list[Edge]:
         """The largest set found in which each and each pair is consistent with the graph.
@@ -160,31 +254,14 @@ def within_gate(off: Array, covariance: Array, probability: float) -> bool:
     return squared < float(chdtri(len(off), probability))
 
 
-def signature(scan: PreparedScan) -> Array:
-    """What a scan looks like, from any heading: logarithms (16,) of quantiles of its ranges."""
-    return np.asarray(np.log(np.quantile(scan.ranges_m, _QUANTILES)), dtype=np.float64)
+def spreads(covariances: Array) -> tuple[Array, Array]:
+    """Standard deviations (K,) of position, m, where it is widest, and of heading."""
+    spread_m = np.linalg.eigvalsh(covariances[:, :2, :2])[:, 1]
+    return np.sqrt(np.maximum(spread_m, 0.0)), np.sqrt(np.maximum(covariances[:, 2, 2], 0.0))
 
 
-def look_alike(one: Array, others: Array) -> NDArray[np.bool_]:
-    """Whether signatures (K, 16) are like another one (16,)."""
-    return np.asarray(np.abs(others - one).mean(axis=1) < _ALIKE)
-
-
-def _starts(expected: Gaussian) -> Array:
-    """Starts (K, 3) that cover what the motion may be, the expected one first.
-
-    They fill the ellipse of the position out to three standard deviations, each with the heading
-    that goes with its place; there is one either way at least.
-    """
-    P = expected.covariance
-    variances, axes = np.linalg.eigh(P[:2, :2])
-    half = np.maximum(_REACH_SIGMAS * np.sqrt(np.maximum(variances, 0.0)), _START_M / 4.0)
-    steps = np.clip(np.ceil(half / _START_M), 1, _MOST_STEPS).astype(int)
-    grids = [np.linspace(-1.0, 1.0, 2 * n + 1) for n in steps]
-    offsets = np.stack(np.meshgrid(*grids, indexing="ij"), axis=-1).reshape(-1, 2)
-    away = np.hypot(offsets[:, 0], offsets[:, 1])
-    order = np.argsort(away, kind="stable")
-    moved = (offsets * half)[order[away[order] < 1.0 + 1e-9]] @ axes.T
-    turns = moved @ np.linalg.solve(P[:2, :2] + 1e-12 * np.eye(2), P[:2, 2])
-    turns = np.clip(turns, -_MOST_TURN_RAD, _MOST_TURN_RAD)
-    return np.asarray(expected.mean + np.column_stack([moved, turns]), dtype=np.float64)
+def certain(covariance: Array) -> bool:
+    """Whether a relative pose is known well enough to register two scans from there."""
+    sigma_m, sigma_rad = spreads(covariance[None])
+    near = _REACH_SIGMAS * sigma_m < _CERTAIN_M
+    return bool((near & (_REACH_SIGMAS * sigma_rad < _CERTAIN_RAD))[0])

@@ -1,0 +1,274 @@
+"""Where a patch of new path lies on a patch of old path: correlative search by branch and bound.
+
+A patch is what the laser saw along a few metres of path, in the frame of one key frame: it tells
+places apart that look alike in a single scan. Its walls are drawn on a grid, and every pose within
+reach is compared; each level of a pyramid of maxima bounds the score of all poses in its cells
+(olson2009, hess2016). Walls of one patch in the free space of the other deny that both are one
+place.
+
+Sources: Olson, Real-time correlative scan matching, ICRA 2009; Hess et al., Real-time loop closure
+in 2D LIDAR SLAM, ICRA 2016.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from estimators.gaussian import Gaussian
+from sim import se2
+from sim.arrays import Array, Ints, Values
+from sim.compiled import njit
+
+CELL_M = 0.1
+_SPREAD_M = 0.12  # of a wall, as drawn
+_RANGE_M = 12.0  # beams beyond are not drawn
+_LEVELS = 6
+_HALF = int(1.25 * _RANGE_M / CELL_M) + 2 ** (_LEVELS - 1)  # cells either way
+_SPACING_M = 0.2  # between the points of a patch
+_MOST_POINTS = 160  # of them, that are compared
+_TURN_RAD = 0.015  # between two headings
+_GATE_SQUARED = 16.3  # Mahalanobis, 3 degrees of freedom, 99.9 %
+_BY_PRIOR = 0.01  # share of the score that a pose loses per squared Mahalanobis distance
+_MOST_TURN_RAD = 0.8
+
+
+class Patch(NamedTuple):
+    """What was seen along a few metres of path.
+
+    Attributes
+    ----------
+    points, origins
+        (K, 2) m, points on walls and the laser that saw them, in the frame of a key frame.
+    levels
+        (6, N, N) uint8 where walls are, and the pyramid of its maxima, the key frame in the middle.
+    free
+        (N, N) whether a beam went through.
+    """
+
+    points: Array
+    origins: Array
+    levels: Values
+    free: Values
+
+
+class Place(NamedTuple):
+    """A pose (3,) found in the frame of a patch, and the share of points that fit there."""
+
+    pose: Array
+    score: float
+
+
+def make_patch(poses: Array, seen: list[Array], mount: Array) -> Patch:
+    """Patch in the frame in which the key frames' poses (M, 3) are given.
+
+    Parameters
+    ----------
+    seen
+        Points (K, 2) m of each key frame, in the frame of the laser.
+    mount
+        (3,) of the laser.
+    """
+    points, origins = [np.zeros((0, 2))], [np.zeros((0, 2))]
+    for pose, local in zip(se2.compose(poses, mount), seen, strict=True):
+        near = local[np.hypot(local[:, 0], local[:, 1]) < _RANGE_M]
+        points.append(se2.transform(pose, near))
+        origins.append(np.tile(pose[:2], (len(near), 1)))
+    all_points, all_origins = np.concatenate(points), np.concatenate(origins)
+    cells = np.floor(all_points / _SPACING_M).astype(np.int64)
+    _, first = np.unique(cells[:, 0] * 100_003 + cells[:, 1], return_index=True)
+    first.sort()
+    field, free = _draw(all_points, all_points[first], all_origins[first])
+    return Patch(all_points[first], all_origins[first], _pyramid(field), free)
+
+
+def find_places(
+    new: Patch, old: Patch, expected: Gaussian, reach_m: float, floor: float
+) -> list[Place]:
+    """The best pose of one patch in the frame of another, and the next best somewhere else.
+
+    Parameters
+    ----------
+    expected
+        Pose of the new patch as believed; poses beyond its gate are not compared.
+    reach_m
+        Nor are those farther than this from the old patch's key frame.
+    floor
+        Least share of points that must fit.
+    """
+    points = new.points
+    if len(points) > _MOST_POINTS:
+        points = points[np.linspace(0, len(points) - 1, _MOST_POINTS).astype(np.int64)]
+    if len(points) == 0:
+        return []
+    sigma = np.sqrt(np.diag(expected.covariance)) * math.sqrt(_GATE_SQUARED)
+    half = min(sigma[2], _MOST_TURN_RAD)
+    turns = expected.mean[2] + np.linspace(-half, half, 2 * math.ceil(half / _TURN_RAD) + 1)
+    low = np.maximum(expected.mean[:2] - sigma[:2] - CELL_M, -reach_m)
+    high = np.minimum(expected.mean[:2] + sigma[:2] + CELL_M, reach_m)
+    if (low >= high).any():
+        return []
+    box = np.concatenate([np.floor(low / CELL_M), np.ceil(high / CELL_M)]).astype(np.int64)
+    information = np.linalg.inv(expected.covariance)
+    found: list[Place] = []
+    elsewhere = np.full(3, np.inf)
+    for least in (floor, None):
+        bound = floor if least is not None else 0.8 * found[0].score
+        score, x, y, k = _search(
+            old.levels, points, turns, box, expected.mean, information, bound, elsewhere
+        )
+        if k < 0:
+            break
+        elsewhere = np.array([x, y, turns[k]])
+        found.append(Place(elsewhere, score))
+    return found
+
+
+def agreement(new: Patch, old: Patch, pose: Array) -> tuple[float, float]:
+    """Share of points that fit of those that either patch sees, and share that is seen, at a pose.
+
+    The pose (3,) is that of the new patch in the frame of the old.
+    """
+    hits, denied = _tally(old.levels[0], old.free, se2.transform(pose, new.points))
+    more, against = _tally(new.levels[0], new.free, se2.transform(se2.inverse(pose), old.points))
+    known = hits + denied + more + against
+    total = len(new.points) + len(old.points)
+    fitting = min(hits / max(hits + denied, 1), more / max(more + against, 1))
+    return fitting, known / max(total, 1)
+
+
+@njit(error_model="numpy")
+def _draw(points: Array, ends: Array, origins: Array) -> tuple[Values, Values]:
+    """Walls (N, N) uint8, and whether beams went through."""
+    n = 2 * _HALF
+    field, free = np.zeros((n, n), np.uint8), np.zeros((n, n), np.uint8)
+    rim = 2 ** (_LEVELS - 1)
+    for k in range(len(ends)):
+        dx, dy = ends[k, 0] - origins[k, 0], ends[k, 1] - origins[k, 1]
+        length = math.hypot(dx, dy)
+        steps = int((length - 2.0 * CELL_M) / CELL_M)
+        for s in range(steps):
+            part = s * CELL_M / length
+            c = int(math.floor((origins[k, 0] + part * dx) / CELL_M)) + _HALF
+            r = int(math.floor((origins[k, 1] + part * dy) / CELL_M)) + _HALF
+            if rim <= c < n - rim and rim <= r < n - rim:
+                free[r, c] = 1
+    for k in range(len(points)):
+        x, y = points[k, 0] / CELL_M + _HALF, points[k, 1] / CELL_M + _HALF
+        c0, r0 = int(math.floor(x)), int(math.floor(y))
+        if not (rim <= c0 < n - rim and rim <= r0 < n - rim):
+            continue
+        for r in range(r0 - 2, r0 + 3):
+            for c in range(c0 - 2, c0 + 3):
+                d2 = ((c + 0.5 - x) ** 2 + (r + 0.5 - y) ** 2) * CELL_M**2
+                value = np.uint8(255.0 * math.exp(-0.5 * d2 / _SPREAD_M**2))
+                if value > field[r, c]:
+                    field[r, c] = value
+    return field, free
+
+
+@njit(error_model="numpy")
+def _pyramid(field: Values) -> Values:
+    """Levels (L, N, N): the greatest value of the 2^l cells up and right of each."""
+    n = len(field)
+    levels = np.zeros((_LEVELS, n, n), np.uint8)
+    levels[0] = field
+    for h in range(1, _LEVELS):
+        step = 2 ** (h - 1)
+        for r in range(n):
+            for c in range(n):
+                most = levels[h - 1, r, c]
+                if r + step < n:
+                    most = max(most, levels[h - 1, r + step, c])
+                if c + step < n:
+                    most = max(most, levels[h - 1, r, c + step])
+                    if r + step < n:
+                        most = max(most, levels[h - 1, r + step, c + step])
+                levels[h, r, c] = most
+    return levels
+
+
+@njit(error_model="numpy")
+def _score(level: Values, cells: Ints, x: int, y: int) -> float:
+    """Mean value under the points (K, 2), moved by whole cells, from 0 to 1."""
+    n, total = len(level), 0
+    for k in range(len(cells)):
+        c, r = cells[k, 0] + x, cells[k, 1] + y
+        if 0 <= c < n and 0 <= r < n:
+            total += level[r, c]
+    return total / (255.0 * len(cells))
+
+
+@njit(error_model="numpy")
+def _search(
+    levels: Values, points: Array, turns: Array, box: Ints, mean: Array, information: Array,
+    floor: float, elsewhere: Array,
+) -> tuple[float, float, float, int]:  # fmt: skip
+    """The best score above a floor, its place x, y, m, and its heading's number, or -1."""
+    cells = np.empty((len(turns), len(points), 2), np.int64)
+    for t in range(len(turns)):
+        cos, sin = math.cos(turns[t]), math.sin(turns[t])
+        for k in range(len(points)):
+            x = cos * points[k, 0] - sin * points[k, 1]
+            y = sin * points[k, 0] + cos * points[k, 1]
+            cells[t, k, 0] = int(math.floor(x / CELL_M)) + _HALF
+            cells[t, k, 1] = int(math.floor(y / CELL_M)) + _HALF
+    top = len(levels) - 1
+    while top > 0 and 2**top > max(box[2] - box[0], box[3] - box[1]):
+        top -= 1
+    side = 2**top
+    roots = [(0.0, 0, 0, 0, 0)]
+    roots.pop()
+    for t in range(len(turns)):
+        for x in range(box[0], box[2] + 1, side):
+            for y in range(box[1], box[3] + 1, side):
+                score = _score(levels[top], cells[t], x, y)
+                if score > floor:
+                    roots.append((score, t, x, y, top))
+    roots.sort()
+    best, best_x, best_y, best_turn = floor, 0.0, 0.0, -1
+    while len(roots) > 0:
+        score, t, x, y, h = roots.pop()
+        if score <= best:
+            continue
+        if h > 0:
+            half = 2 ** (h - 1)
+            children = [(0.0, 0, 0, 0, 0)]
+            children.pop()
+            for dx in (0, half):
+                for dy in (0, half):
+                    if x + dx <= box[2] and y + dy <= box[3]:
+                        score = _score(levels[h - 1], cells[t], x + dx, y + dy)
+                        if score > best:
+                            children.append((score, t, x + dx, y + dy, h - 1))
+            children.sort()
+            for child in children:
+                roots.append(child)
+            continue
+        px, py = x * CELL_M, y * CELL_M
+        a, b, c = px - mean[0], py - mean[1], turns[t] - mean[2]
+        squared = (
+            information[0, 0] * a * a + information[1, 1] * b * b + information[2, 2] * c * c
+            + 2.0 * (information[0, 1] * a * b + information[0, 2] * a * c + information[1, 2] * b * c)
+        )  # fmt: skip
+        apart = math.hypot(px - elsewhere[0], py - elsewhere[1])
+        same = apart < 0.6 and abs(turns[t] - elsewhere[2]) < 0.3
+        worth = score - _BY_PRIOR * squared
+        if squared < _GATE_SQUARED and not same and worth > best:
+            best, best_x, best_y, best_turn = worth, px, py, t
+    return best, best_x, best_y, best_turn
+
+
+@njit(error_model="numpy")
+def _tally(field: Values, free: Values, points: Array) -> tuple[int, int]:
+    """How many of these points are on walls, and how many in free space."""
+    n, hits, denied = len(field), 0, 0
+    for k in range(len(points)):
+        c = int(math.floor(points[k, 0] / CELL_M)) + _HALF
+        r = int(math.floor(points[k, 1] / CELL_M)) + _HALF
+        if 0 <= c < n and 0 <= r < n:
+            if field[r, c] > 0:
+                hits += 1
+            elif free[r, c] > 0:
+                denied += 1
+    return hits, denied

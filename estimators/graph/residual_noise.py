@@ -1,0 +1,62 @@
+"""What wheels and registrations really err by, from how they disagree along the drive.
+
+Wheels are compared with registrations from key frame to key frame, and a registration over two key
+frames with the two that it spans. What is believed is widened where they disagree by more; it is
+never narrowed. Differences count up to four times their median, so that a slip or a wrong
+registration does not widen all others.
+"""
+
+import collections
+
+import numpy as np
+
+from estimators.gaussian import Gaussian
+from sim import se2
+from sim.arrays import Array
+
+_REMEMBERED = 60  # comparisons
+_MOST = np.array([1e4, 1e4, 1e4])
+_LIMIT = 16.0  # of squares, in medians
+_MOST_OF_SCANS = 400.0
+
+
+class ResidualNoise:
+    """Scales of the covariances of wheels and registrations, from what was compared so far.
+
+    Attributes
+    ----------
+    of_wheels
+        (3,) of the variances of a motion by wheels, along, across and of the turn; 1 or more.
+    of_scans
+        Of the covariance of a registration; 1 or more.
+    """
+
+    def __init__(self) -> None:
+        self.of_wheels, self.of_scans = np.ones(3), 1.0
+        self._wheels: collections.deque[Array] = collections.deque(maxlen=_REMEMBERED)
+        self._scans: collections.deque[float] = collections.deque(maxlen=_REMEMBERED)
+
+    def widened(self, motion: Gaussian) -> Gaussian:
+        """A motion by wheels with the covariance that it has shown."""
+        root = np.sqrt(self.of_wheels)
+        return Gaussian(motion.mean, motion.covariance * np.outer(root, root))
+
+    def compare_wheels(self, by_wheels: Gaussian, registered: Gaussian) -> None:
+        """Take in a motion by wheels, as believed at first, and as registered."""
+        off = se2.difference(registered.mean, by_wheels.mean)
+        believed = np.diag(by_wheels.covariance), np.diag(registered.covariance)
+        self._wheels.append(np.array([off**2, *believed]))
+        squared, own, others = np.array(self._wheels).transpose(1, 0, 2)
+        kept = np.minimum(squared, _LIMIT * np.median(squared, axis=0))
+        excess = kept.mean(axis=0) - others.mean(axis=0)
+        self.of_wheels = np.clip(excess / np.maximum(own.mean(axis=0), 1e-12), 1.0, _MOST)
+
+    def compare_scans(self, direct: Gaussian, first: Gaussian, second: Gaussian) -> None:
+        """Take in a registration, and the two that lead the same way, as believed at first."""
+        around = first.then(second)
+        off = se2.difference(direct.mean, around.mean)
+        spread = direct.covariance + around.covariance
+        self._scans.append(float(off @ np.linalg.solve(spread, off)))
+        squared = np.array(self._scans)
+        kept = np.minimum(squared, _LIMIT * max(float(np.median(squared)), 0.1))
+        self.of_scans = float(np.clip(kept.mean() / 3.0, 1.0, _MOST_OF_SCANS))
