@@ -60,8 +60,8 @@ _HELD_M, _MOST_HELD = 15.0, 24  # how long closures wait for others, of path; an
 _CONSIDERED = 8  # times the candidates whose uncertainty is looked at closely
 _SEARCH_M = 1.0  # of path between two searches for places, and two checks of the map
 _MOST_ANCHORS = 80
-_GATE_SIGMAS = np.array([0.02, 0.02, 0.02]), np.array([0.1, 0.1, 0.1])  # and by the way; m, m, rad
-_PLACED = Gaussian(np.zeros(3), np.diag(np.square([0.1, 0.1, 0.03])))  # noise of a place found
+_FLOOR_SIGMA, _FLOOR_SHARE = 0.02, 0.1  # of wheels that scans deny: m and rad; and of the way
+_RETRIED, _WINDOW_RAD = ("poor_overlap", "not_converged"), 0.5  # with a search of the heading
 _DENIED, _SEEN, _DENIALS = 0.5, 0.3, 4  # share that fits, and is seen; checks in a row
 _WITHDRAWN = 2.0  # times robust_sigma, by which a closure misses the graph that lets go of it
 _ONLINE_TOLERANCE = 1e-4  # of a solution that the next closure refines
@@ -185,6 +185,8 @@ class GraphSlam(GraphSlamOptions):
             self._add_key_frame(scan, None)
             return "first"
         found = self._match(scan, key, self._in_key)
+        if found.status in _RETRIED or not (found.failed or self._explained(found)):
+            found = self._match(scan, key, self._in_key, _WINDOW_RAD)
         status = found.status if found.failed or self._explained(found) else "gated"
         leaves = self.left_key_frame(found.motion.mean)
         if found.status == "ok" and (leaves or status == "gated"):
@@ -205,9 +207,11 @@ class GraphSlam(GraphSlamOptions):
             self._in_key = Gaussian(STILL.mean, own_noise)
         return status
 
-    def _match(self, scan: PreparedScan, other: PreparedScan, guess: Gaussian) -> Match:
+    def _match(
+        self, scan: PreparedScan, other: PreparedScan, guess: Gaussian, window_rad: float = 0.0
+    ) -> Match:
         """Register two scans, with the covariance that registrations have shown."""
-        found = self._matcher.match(scan, other, guess, self._laser, self._rng)
+        found = self._matcher.match(scan, other, guess, self._laser, self._rng, window_rad)
         if found.failed:
             return found
         return dataclasses.replace(found, motion=_scaled(found.motion, self._noise.of_scans))
@@ -232,15 +236,18 @@ class GraphSlam(GraphSlamOptions):
         if self.gate_probability is None or not len(found.held):
             return True
         off = found.held @ se2.difference(found.motion.mean, self._in_key.mean)
-        x, y, turn = self._in_key.mean.tolist()
-        sigmas = _GATE_SIGMAS[0] + _GATE_SIGMAS[1] * (math.hypot(x, y) + abs(turn))
-        expected = self._in_key.covariance + np.diag(sigmas**2)
+        expected = self._in_key.covariance + self._doubt()
         spread = found.held @ (found.motion.covariance + expected) @ found.held.T
         return within_gate(off, spread, self.gate_probability)
 
+    def _doubt(self) -> Array:
+        """Covariance (3, 3) below which wheels are not trusted where scans deny them."""
+        x, y, turn = self._by_wheels.mean.tolist()
+        return (_FLOOR_SIGMA + _FLOOR_SHARE * (math.hypot(x, y) + abs(turn))) ** 2 * np.eye(3)
+
     def _add_key_frame(self, scan: PreparedScan, registered: Gaussian | None) -> None:
         """Append a node, tied by the wheels and by its registration, and look for loops."""
-        by_wheels = self._noise.widened(self._by_wheels)
+        by_wheels = self._noise.widened(self._by_wheels, alone=registered is None)
         measured = [Gaussian(by_wheels.mean, by_wheels.covariance + FLOOR)]
         if registered is not None:
             measured.append(registered)
@@ -287,7 +294,6 @@ class GraphSlam(GraphSlamOptions):
         if far.any():
             kept = [e for e, off in zip(self.graph.closures, far, strict=True) if not off]
             self.graph.keep(kept, tolerance)
-        self._patches.forget()
 
     def _check_map(self, near: Ints) -> None:
         """Withdraw the last loop where the path since then does not fit the map that it made."""
@@ -312,7 +318,6 @@ class GraphSlam(GraphSlamOptions):
             since = self._groups.pop()
             self.graph.keep([e for e in self.graph.closures if e.second < since])
             self._denials, self._held = 0, []
-            self._patches.forget()
 
     def propose_closures(self) -> list[Edge]:
         """Closures of the newest key frame that pass each on its own."""
@@ -328,35 +333,32 @@ class GraphSlam(GraphSlamOptions):
             self._check_map(nearest[known])
         typical = self.graph.noise[newest]
         worth = np.array([self._search.worthwhile(P, typical) for P in covariances])
-        if (worth & known).any():
-            return self._closures(newest, nearest[known], motions[known], covariances[known])
+        found = self._closures(newest, nearest[known], motions[known], covariances[known])
         now_m = self._driven_m(-1)
-        if not (worth & ~known).any() or now_m - self._searched_m < _SEARCH_M:
-            return []
+        if found or not worth.any() or now_m - self._searched_m < _SEARCH_M:
+            return found
         self._searched_m = now_m
         anchors = self._patches.anchors()
-        return self._closures_of_place(newest, anchors[np.isin(anchors, nodes)][:_MOST_ANCHORS])
+        anchors = anchors[np.isin(anchors, nodes)][:_MOST_ANCHORS]
+        return self._closures_of_place(newest, anchors, 0.0 if known.all() else self.loop_support_m)
 
-    def _closures_of_place(self, newest: int, anchors: Ints) -> list[Edge]:
+    def _closures_of_place(self, newest: int, anchors: Ints, support_m: float) -> list[Edge]:
         """Where the newest key frame is, of all places that it may be at."""
         found = self._search.find_place(self.graph, self._patches, newest, anchors)
         if found is None:
             return []
         anchor, place = found
-        graph = self.graph
-        at = se2.compose(graph.poses[anchor], place.pose)
+        at = se2.compose(self.graph.poses[anchor], place.mean)
         old = np.flatnonzero(self._patches.driven_m < self._driven_m(-1) - 8.0)
-        motions = se2.between(graph.poses[old], at)
+        motions = se2.between(self.graph.poses[old], at)
         facing = np.abs(motions[:, 2]) < 0.8
         order = np.argsort(np.where(facing, np.hypot(motions[:, 0], motions[:, 1]), np.inf))
         edges = []
         for k in order[: self.loop_candidates].tolist():
-            expected = Gaussian(motions[k], _PLACED.covariance)
-            edge = self._closure(int(old[k]), newest, expected, 0.0, self.loop_support_m)
+            expected = Gaussian(motions[k], place.covariance)
+            edge = self._closure(int(old[k]), newest, expected, 0.0, support_m)
             edges += [edge] if edge is not None else []
-        if edges:
-            return edges
-        return [Edge(anchor, newest, Gaussian(place.pose, _PLACED.covariance), self.loop_support_m)]
+        return edges or [Edge(anchor, newest, place, support_m)]
 
     def _revised_closures(self) -> list[Edge]:
         """More closures between key frames that the graph shows to be near each other."""
@@ -401,14 +403,13 @@ class GraphSlam(GraphSlamOptions):
         if found.failed:
             return None
         off = se2.difference(found.motion.mean, expected.mean)
-        spread = expected.covariance + found.motion.covariance
-        if not within_gate(off, spread, self.loop_gate_probability):
+        noise = found.motion.covariance
+        if not within_gate(off, expected.covariance + noise, self.loop_gate_probability):
             return None
-        if min_gain is None and not self._search.worthwhile(
-            expected.covariance, found.motion.covariance
-        ):
+        if min_gain is None and not self._search.worthwhile(expected.covariance, noise):
             return None
-        return Edge(first, second, found.motion, support_m)
+        mean = found.motion.mean - found.loose @ off  # nothing is known of it, so let it be
+        return Edge(first, second, Gaussian(mean, noise), support_m)
 
 
 def _scaled(motion: Gaussian, share: float) -> Gaussian:

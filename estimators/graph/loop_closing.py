@@ -24,7 +24,13 @@ from pydantic import Field
 from scipy.special import chdtri
 
 from estimators.gaussian import Gaussian
-from estimators.graph.place_search import Patch, Place, agreement, find_places, make_patch
+from estimators.graph.place_search import (
+    Patch,
+    agreement,
+    find_places,
+    make_patch,
+    refine,
+)
 from estimators.graph.pose_graph import Edge, PoseGraph
 from estimators.laser.icp import PreparedScan
 from estimators.laser.scan_matching import ScanMatcher
@@ -40,7 +46,7 @@ _EVERY_M = 1.0  # of new path, places are looked for; of old path, one is compar
 _MIN_FIT = 0.45  # share of a patch's points that must lie on walls of the other
 _MIN_AGREEMENT, _MIN_SEEN = 0.75, 0.4  # of what both could see; and how much that must be
 _AHEAD = 0.9  # the second best place must have less than this share of the best one's score
-_KEPT_PATCHES = 60
+_KEPT_PATCHES, _BENT = 100, 0.1  # m and rad, of key frames within a patch
 _NEIGHBOURS = 8  # key frames either way
 _SAME_M, _SAME_RAD = 0.15, 0.05  # closures that miss the graph alike
 
@@ -83,7 +89,7 @@ class Patches:
     def __init__(self, mount: Array) -> None:
         self.key_frames: list[Seen] = []
         self._mount = mount
-        self._drawn: dict[int, Patch] = {}
+        self._drawn: dict[int, tuple[Patch, Array]] = {}
 
     @property
     def driven_m(self) -> Array:
@@ -98,28 +104,37 @@ class Patches:
         return np.flatnonzero(inside & (np.diff(steps, prepend=-1.0) > 0.0))
 
     def old(self, graph: PoseGraph, node: int) -> Patch:
-        """What was seen about an old key frame."""
-        if node not in self._drawn:
-            if len(self._drawn) >= _KEPT_PATCHES:
-                del self._drawn[next(iter(self._drawn))]
-            self._drawn[node] = self._draw(graph, node, _OLD_M, _OLD_M)
-        return self._drawn[node]
+        """What was seen about an old key frame; drawn again if the graph has bent it."""
+        members, poses = self._members(graph, node, _OLD_M, _OLD_M)
+        if node in self._drawn:
+            patch, then = self._drawn.pop(node)
+            if np.abs(se2.difference(poses, then)).max() > _BENT:
+                patch = self._draw(members, poses)
+                then = poses
+        else:
+            patch, then = self._draw(members, poses), poses
+        if len(self._drawn) >= _KEPT_PATCHES:
+            del self._drawn[next(iter(self._drawn))]
+        self._drawn[node] = patch, then
+        return patch
 
     def new(self, graph: PoseGraph, node: int) -> Patch:
         """What was seen on the way to a key frame."""
-        return self._draw(graph, node, _NEW_M, 0.0)
+        return self._draw(*self._members(graph, node, _NEW_M, 0.0))
 
-    def forget(self) -> None:
-        """Draw patches again: the graph has moved."""
-        self._drawn.clear()
-
-    def _draw(self, graph: PoseGraph, node: int, back_m: float, ahead_m: float) -> Patch:
+    def _members(
+        self, graph: PoseGraph, node: int, back_m: float, ahead_m: float
+    ) -> tuple[Ints, Array]:
+        """Key frames of a patch, and their poses (M, 3) in its frame."""
         driven_m = self.driven_m - self.key_frames[node].driven_m
         members = np.flatnonzero((driven_m >= -back_m) & (driven_m <= ahead_m))
-        members = [i for i in members.tolist() if self.key_frames[i].scan is not None]
-        poses = se2.between(graph.poses[node], graph.poses[members])
-        seen = [scan.points for i in members if (scan := self.key_frames[i].scan) is not None]
-        return make_patch(poses.reshape(-1, 3), seen, self._mount)
+        members = members[members > 0]  # the start has no scan
+        return members, se2.between(graph.poses[node], graph.poses[members]).reshape(-1, 3)
+
+    def _draw(self, members: Ints, poses: Array) -> Patch:
+        scans = [self.key_frames[i].scan for i in members.tolist()]
+        seen = [np.zeros((0, 2)) if scan is None else scan.points for scan in scans]
+        return make_patch(poses, seen, self._mount)
 
 
 @dataclass(frozen=True)
@@ -161,7 +176,7 @@ class LoopSearch:
 
     def find_place(
         self, graph: PoseGraph, patches: Patches, node: int, anchors: Ints
-    ) -> tuple[int, Place] | None:
+    ) -> tuple[int, Gaussian] | None:
         """The old place, of all within the uncertainty, where the newest key frame is.
 
         None if there is none, or two that differ explain the last metres about as well.
@@ -190,7 +205,7 @@ class LoopSearch:
                 off = se2.between(at, se2.compose(graph.poses[other], its_pose))
                 if math.hypot(off[0], off[1]) > 1.0 or abs(off[2]) > 0.3:
                     return None
-        return anchor, Place(pose, score)
+        return anchor, refine(new, patches.old(graph, anchor), pose)
 
     def fits(self, new: Patch, old: Patch, pose: Array) -> tuple[float, float]:
         """Share of points that fit, of those that either patch sees, and share that is seen."""

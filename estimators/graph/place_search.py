@@ -31,6 +31,8 @@ _TURN_RAD = 0.015  # between two headings
 _GATE_SQUARED = 16.3  # Mahalanobis, 3 degrees of freedom, 99.9 %
 _BY_PRIOR = 0.01  # share of the score that a pose loses per squared Mahalanobis distance
 _MOST_TURN_RAD = 0.8
+_STEPS, _MISFIT = 6, 0.1  # of the refinement; and variance of what walls are drawn as
+_SIGMA_M, _SIGMA_RAD = 0.03, 0.005  # at least, of a place found
 
 
 class Patch(NamedTuple):
@@ -53,7 +55,7 @@ class Patch(NamedTuple):
 
 
 class Place(NamedTuple):
-    """A pose (3,) found in the frame of a patch, and the share of points that fit there."""
+    """A pose (3,) found in the frame of a patch, and how well the points fit there, up to 1."""
 
     pose: Array
     score: float
@@ -137,6 +139,56 @@ def agreement(new: Patch, old: Patch, pose: Array) -> tuple[float, float]:
     return fitting, known / max(total, 1)
 
 
+def refine(new: Patch, old: Patch, pose: Array) -> Gaussian:
+    """The pose nearby at which most points lie on walls, and its covariance.
+
+    Gauss-Newton on the walls as drawn (Kohlbrecher et al., SSRR 2011). Neighbouring points share
+    what walls and drawing err by, so the covariance is that of a quarter of them.
+    """
+    found, H = _climb(old.levels[0], new.points, pose.copy())
+    least = np.diag(np.square([_SIGMA_M, _SIGMA_M, _SIGMA_RAD]))
+    covariance = 4.0 * _MISFIT * np.linalg.inv(H + np.diag([0.01, 0.01, 0.01]))
+    return Gaussian(found, covariance + least)
+
+
+@njit(error_model="numpy")
+def _climb(field: Values, points: Array, pose: Array) -> tuple[Array, Array]:
+    """The pose after a few steps, and its normal matrix."""
+    n, H = len(field), np.zeros((3, 3))
+    start = pose.copy()
+    for _ in range(_STEPS):
+        cos, sin = math.cos(pose[2]), math.sin(pose[2])
+        H, g = np.zeros((3, 3)), np.zeros(3)
+        for k in range(len(points)):
+            qx = cos * points[k, 0] - sin * points[k, 1]
+            qy = sin * points[k, 0] + cos * points[k, 1]
+            u = (qx + pose[0]) / CELL_M + _HALF - 0.5
+            v = (qy + pose[1]) / CELL_M + _HALF - 0.5
+            c, r = math.floor(u), math.floor(v)
+            if not (0 <= c < n - 1 and 0 <= r < n - 1):
+                continue
+            a, b = u - c, v - r
+            m00, m01 = field[r, c] / 255.0, field[r, c + 1] / 255.0
+            m10, m11 = field[r + 1, c] / 255.0, field[r + 1, c + 1] / 255.0
+            value = (1 - b) * ((1 - a) * m00 + a * m01) + b * ((1 - a) * m10 + a * m11)
+            if value == 0.0:
+                continue
+            dx = ((1 - b) * (m01 - m00) + b * (m11 - m10)) / CELL_M
+            dy = ((1 - a) * (m10 - m00) + a * (m11 - m01)) / CELL_M
+            J = (dx, dy, dy * qx - dx * qy)
+            for i in range(3):
+                g[i] += J[i] * (1.0 - value)
+                for j in range(3):
+                    H[i, j] += J[i] * J[j]
+        damped = H.copy()
+        for i in range(3):
+            damped[i, i] += 0.01 * H[i, i] + 1.0
+        pose += np.linalg.solve(damped, g)
+    if math.hypot(pose[0] - start[0], pose[1] - start[1]) > 0.3 or abs(pose[2] - start[2]) > 0.1:
+        return start, H
+    return pose, H
+
+
 @njit(error_model="numpy")
 def _draw(points: Array, ends: Array, origins: Array) -> tuple[Values, Values]:
     """Walls (N, N) uint8, and whether beams went through."""
@@ -149,13 +201,13 @@ def _draw(points: Array, ends: Array, origins: Array) -> tuple[Values, Values]:
         steps = int((length - 2.0 * CELL_M) / CELL_M)
         for s in range(steps):
             part = s * CELL_M / length
-            c = int(math.floor((origins[k, 0] + part * dx) / CELL_M)) + _HALF
-            r = int(math.floor((origins[k, 1] + part * dy) / CELL_M)) + _HALF
+            c = math.floor((origins[k, 0] + part * dx) / CELL_M) + _HALF
+            r = math.floor((origins[k, 1] + part * dy) / CELL_M) + _HALF
             if rim <= c < n - rim and rim <= r < n - rim:
                 free[r, c] = 1
     for k in range(len(points)):
         x, y = points[k, 0] / CELL_M + _HALF, points[k, 1] / CELL_M + _HALF
-        c0, r0 = int(math.floor(x)), int(math.floor(y))
+        c0, r0 = math.floor(x), math.floor(y)
         if not (rim <= c0 < n - rim and rim <= r0 < n - rim):
             continue
         for r in range(r0 - 2, r0 + 3):
@@ -174,17 +226,12 @@ def _pyramid(field: Values) -> Values:
     levels = np.zeros((_LEVELS, n, n), np.uint8)
     levels[0] = field
     for h in range(1, _LEVELS):
-        step = 2 ** (h - 1)
-        for r in range(n):
-            for c in range(n):
-                most = levels[h - 1, r, c]
-                if r + step < n:
-                    most = max(most, levels[h - 1, r + step, c])
-                if c + step < n:
-                    most = max(most, levels[h - 1, r, c + step])
-                    if r + step < n:
-                        most = max(most, levels[h - 1, r + step, c + step])
-                levels[h, r, c] = most
+        step, below, own = 2 ** (h - 1), levels[h - 1], levels[h]
+        own[:] = below
+        for r in range(n - step):  # the rim is empty
+            for c in range(n - step):
+                first = max(below[r, c], below[r, c + step])
+                own[r, c] = max(first, below[r + step, c], below[r + step, c + step])
     return levels
 
 
@@ -211,8 +258,8 @@ def _search(
         for k in range(len(points)):
             x = cos * points[k, 0] - sin * points[k, 1]
             y = sin * points[k, 0] + cos * points[k, 1]
-            cells[t, k, 0] = int(math.floor(x / CELL_M)) + _HALF
-            cells[t, k, 1] = int(math.floor(y / CELL_M)) + _HALF
+            cells[t, k, 0] = math.floor(x / CELL_M) + _HALF
+            cells[t, k, 1] = math.floor(y / CELL_M) + _HALF
     top = len(levels) - 1
     while top > 0 and 2**top > max(box[2] - box[0], box[3] - box[1]):
         top -= 1
@@ -247,10 +294,9 @@ def _search(
             continue
         px, py = x * CELL_M, y * CELL_M
         a, b, c = px - mean[0], py - mean[1], turns[t] - mean[2]
-        squared = (
-            information[0, 0] * a * a + information[1, 1] * b * b + information[2, 2] * c * c
-            + 2.0 * (information[0, 1] * a * b + information[0, 2] * a * c + information[1, 2] * b * c)
-        )  # fmt: skip
+        squared = information[0, 0] * a * a + information[1, 1] * b * b
+        squared += information[2, 2] * c * c + 2.0 * information[0, 1] * a * b
+        squared += 2.0 * c * (information[0, 2] * a + information[1, 2] * b)
         apart = math.hypot(px - elsewhere[0], py - elsewhere[1])
         same = apart < 0.6 and abs(turns[t] - elsewhere[2]) < 0.3
         worth = score - _BY_PRIOR * squared
@@ -264,8 +310,8 @@ def _tally(field: Values, free: Values, points: Array) -> tuple[int, int]:
     """How many of these points are on walls, and how many in free space."""
     n, hits, denied = len(field), 0, 0
     for k in range(len(points)):
-        c = int(math.floor(points[k, 0] / CELL_M)) + _HALF
-        r = int(math.floor(points[k, 1] / CELL_M)) + _HALF
+        c = math.floor(points[k, 0] / CELL_M) + _HALF
+        r = math.floor(points[k, 1] / CELL_M) + _HALF
         if 0 <= c < n and 0 <= r < n:
             if field[r, c] > 0:
                 hits += 1

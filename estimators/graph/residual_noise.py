@@ -2,7 +2,7 @@
 
 Wheels are compared with registrations from key frame to key frame, and a registration over two key
 frames with the two that it spans. What is believed is widened where they disagree by more; it is
-never narrowed. Differences count up to four times their median, so that a slip or a wrong
+never narrowed. Differences count up to five times their median, so that a slip or a wrong
 registration does not widen all others.
 """
 
@@ -15,8 +15,8 @@ from sim import se2
 from sim.arrays import Array
 
 _REMEMBERED = 60  # comparisons
-_MOST = np.array([1e4, 1e4, 1e4])
-_LIMIT = 16.0  # of squares, in medians
+_MOST = 1e4
+_LIMIT = 25.0  # of squares, in medians
 _MOST_OF_SCANS = 400.0
 
 
@@ -29,16 +29,19 @@ class ResidualNoise:
         (3,) of the variances of a motion by wheels, along, across and of the turn; 1 or more.
     of_scans
         Of the covariance of a registration; 1 or more.
+    of_wheels_alone
+        (3,) as `of_wheels`, with all slips: where wheels are all there is.
     """
 
     def __init__(self) -> None:
         self.of_wheels, self.of_scans = np.ones(3), 1.0
+        self.of_wheels_alone = np.ones(3)
         self._wheels: collections.deque[Array] = collections.deque(maxlen=_REMEMBERED)
         self._scans: collections.deque[float] = collections.deque(maxlen=_REMEMBERED)
 
-    def widened(self, motion: Gaussian) -> Gaussian:
-        """A motion by wheels with the covariance that it has shown."""
-        root = np.sqrt(self.of_wheels)
+    def widened(self, motion: Gaussian, *, alone: bool = False) -> Gaussian:
+        """A motion by wheels with the covariance that they have shown, or show at worst."""
+        root = np.sqrt(self.of_wheels_alone if alone else self.of_wheels)
         return Gaussian(motion.mean, motion.covariance * np.outer(root, root))
 
     def compare_wheels(self, by_wheels: Gaussian, registered: Gaussian) -> None:
@@ -48,8 +51,9 @@ class ResidualNoise:
         self._wheels.append(np.array([off**2, *believed]))
         squared, own, others = np.array(self._wheels).transpose(1, 0, 2)
         kept = np.minimum(squared, _LIMIT * np.median(squared, axis=0))
-        excess = kept.mean(axis=0) - others.mean(axis=0)
-        self.of_wheels = np.clip(excess / np.maximum(own.mean(axis=0), 1e-12), 1.0, _MOST)
+        own = np.maximum(own.mean(axis=0), 1e-12)
+        scales = (np.array([kept, squared]).mean(axis=1) - others.mean(axis=0)) / own
+        self.of_wheels, self.of_wheels_alone = np.clip(scales, 1.0, _MOST)
 
     def compare_scans(self, direct: Gaussian, first: Gaussian, second: Gaussian) -> None:
         """Take in a registration, and the two that lead the same way, as believed at first."""
