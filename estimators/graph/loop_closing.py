@@ -122,6 +122,14 @@ class Patches:
         """What was seen on the way to a key frame."""
         return self._draw(*self._members(graph, node, _NEW_M, 0.0))
 
+    def bend(self, graph: PoseGraph, node: int, back_m: float, ahead_m: float) -> Array:
+        """What a patch may be bent by, as covariance (3, 3): a third of its random walk."""
+        members, poses = self._members(graph, node, back_m, ahead_m)
+        x, y, turn = np.sum([np.diag(graph.noise[i]) for i in members.tolist()], axis=0) / 3.0
+        lever = float(np.mean(poses[:, :2] ** 2)) if len(poses) else 0.0
+        across = (min(x, 1.0) + min(y, 1.0)) / 2.0 + lever * turn
+        return np.diag([across, across, turn])
+
     def _members(
         self, graph: PoseGraph, node: int, back_m: float, ahead_m: float
     ) -> tuple[Ints, Array]:
@@ -205,7 +213,9 @@ class LoopSearch:
                 off = se2.between(at, se2.compose(graph.poses[other], its_pose))
                 if math.hypot(off[0], off[1]) > 1.0 or abs(off[2]) > 0.3:
                     return None
-        return anchor, refine(new, patches.old(graph, anchor), pose)
+        place = refine(new, patches.old(graph, anchor), pose)
+        bend = patches.bend(graph, anchor, _OLD_M, _OLD_M) + patches.bend(graph, node, _NEW_M, 0.0)
+        return anchor, Gaussian(place.mean, place.covariance + bend)
 
     def fits(self, new: Patch, old: Patch, pose: Array) -> tuple[float, float]:
         """Share of points that fit, of those that either patch sees, and share that is seen."""
