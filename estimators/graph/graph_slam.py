@@ -64,7 +64,6 @@ _FLOOR_SIGMA, _FLOOR_SHARE = 0.02, 0.1  # of wheels that scans deny: m and rad; 
 # Of scans that share little, some are registered wrongly: 10 % of those that share 0.65 in a hall of
 # tables and chairs, by 0.2 m
 _LEAST_OVERLAP, _OVERLAP, _WRONG = 0.7, 0.8, np.diag(np.square([0.3, 0.3, 0.06]))
-_RETRIED, _WINDOW_RAD = ("poor_overlap", "not_converged"), 0.5  # with a search of the heading
 _DENIED, _SEEN, _DENIALS = 0.5, 0.3, 4  # share that fits, and is seen; checks in a row
 _MISFIT_M, _MISFIT_RAD, _HELD_BY_M = 0.08, 0.025, 3.0  # closures that others replace
 _WITHDRAWN = 2.0  # times robust_sigma, by which a closure misses the graph that lets go of it
@@ -144,7 +143,7 @@ class GraphSlam(GraphSlamOptions):
     def step(self, frame: Frame) -> Belief:
         """Move by the wheels; register a scan with the key frame; at a new one look for loops."""
         motion = loosen(self._wheels.predict(frame))
-        self._in_key = self._in_key.then(self._noise.widened(motion))
+        self._in_key = self._in_key.then(self._noise.corrected(motion))
         self._by_wheels = self._by_wheels.then(motion)
         self._now = frame.stamp
         extras: dict[str, Any] = {}
@@ -203,15 +202,15 @@ class GraphSlam(GraphSlamOptions):
             self._add_key_frame(scan, None)
             return "first"
         found = self._match(scan, key, self._in_key)
-        if found.status in _RETRIED or not (found.failed or self._explained(found)):
-            found = self._match(scan, key, self._in_key, _WINDOW_RAD)
+        if found.failed or not self._explained(found):
+            found = self._match_path(scan) or found
         status = found.status if found.failed or self._explained(found) else "gated"
         leaves = self.left_key_frame(found.motion.mean) or found.overlap < _LEAST_OVERLAP
         if found.status == "ok" and (leaves or status == "gated"):
             self._noise.compare_wheels(self._by_wheels, found.motion)
         if status in (*FAILED, "gated"):
             self._failures += 1
-            if self._failures >= _PATIENCE:
+            if self._failures >= _PATIENCE or self.left_key_frame(self._in_key.mean):
                 self._add_key_frame(scan, None)
             return status
         self._failures = 0
@@ -225,11 +224,18 @@ class GraphSlam(GraphSlamOptions):
             self._in_key = Gaussian(STILL.mean, own_noise)
         return status
 
-    def _match(
-        self, scan: PreparedScan, other: PreparedScan, guess: Gaussian, window_rad: float = 0.0
-    ) -> Match:
+    def _match_path(self, scan: PreparedScan) -> Match | None:
+        """Register a scan with the last metres of path, where one key frame shows too little."""
+        newest = len(self.graph) - 1
+        guess = Gaussian(self._in_key.mean, self._in_key.covariance + self._doubt())
+        place = self._search.on_path(self._patches.new(self.graph, newest), scan, guess)
+        if place is None:
+            return None
+        return Match(place, "ok", np.eye(3), np.zeros((3, 3)), 1.0)
+
+    def _match(self, scan: PreparedScan, other: PreparedScan, guess: Gaussian) -> Match:
         """Register two scans, with the covariance that registrations have shown."""
-        found = self._matcher.match(scan, other, guess, self._laser, self._rng, window_rad)
+        found = self._matcher.match(scan, other, guess, self._laser, self._rng)
         if found.failed:
             return found
         doubt = max(_OVERLAP - found.overlap, 0.0) ** 2 * _WRONG
@@ -267,7 +273,7 @@ class GraphSlam(GraphSlamOptions):
 
     def _add_key_frame(self, scan: PreparedScan, registered: Gaussian | None) -> None:
         """Append a node, tied by the wheels and by its registration, and look for loops."""
-        by_wheels = self._noise.widened(self._by_wheels, alone=registered is None)
+        by_wheels = self._noise.corrected(self._by_wheels, alone=registered is None)
         measured = [Gaussian(by_wheels.mean, by_wheels.covariance + FLOOR)]
         if registered is not None:
             measured.append(registered)

@@ -217,6 +217,17 @@ class LoopSearch:
         bend = patches.bend(graph, anchor, _OLD_M, _OLD_M) + patches.bend(graph, node, _NEW_M, 0.0)
         return anchor, Gaussian(place.mean, place.covariance + bend)
 
+    def on_path(self, path: Patch, scan: PreparedScan, expected: Gaussian) -> Gaussian | None:
+        """Pose of a scan in the frame of a patch, near where it is expected; None if unclear."""
+        new = make_patch(np.zeros((1, 3)), [scan.points], self.laser.mount.pose)
+        found = find_places(new, path, expected, self.how.loop_reach_m, _MIN_FIT)
+        if not found or (len(found) > 1 and found[1].score > _AHEAD * found[0].score):
+            return None
+        fitting, seen = agreement(new, path, found[0].pose)
+        if fitting < _MIN_AGREEMENT or seen < _MIN_SEEN:
+            return None
+        return refine(new, path, found[0].pose)
+
     def fits(self, new: Patch, old: Patch, pose: Array) -> tuple[float, float]:
         """Share of points that fit, of those that either patch sees, and share that is seen."""
         return agreement(new, old, pose)
