@@ -61,8 +61,8 @@ _CONSIDERED = 8  # times the candidates whose uncertainty is looked at closely
 _SEARCH_M = 1.0  # of path between two searches for places, and two checks of the map
 _MOST_ANCHORS = 80
 _FLOOR_SIGMA, _FLOOR_SHARE = 0.02, 0.1  # of wheels that scans deny: m and rad; and of the way
-# Of scans that share little, some are registered wrongly: 10 % of those that share 0.65 in a hall of
-# tables and chairs, by 0.2 m
+# Of scans that share little, some are registered wrongly: a tenth of those that share 0.65 in a
+# hall of tables and chairs, by 0.2 m
 _LEAST_OVERLAP, _OVERLAP, _WRONG = 0.7, 0.8, np.diag(np.square([0.3, 0.3, 0.06]))
 _DENIED, _SEEN, _DENIALS = 0.5, 0.3, 4  # share that fits, and is seen; checks in a row
 _MISFIT_M, _MISFIT_RAD, _HELD_BY_M = 0.08, 0.025, 3.0  # closures that others replace
@@ -337,7 +337,7 @@ class GraphSlam(GraphSlamOptions):
         pose = se2.between(self.graph.poses[anchor], self.graph.poses[newest])
         new, old = self._patches.new(self.graph, newest), self._patches.old(self.graph, anchor)
         fitting, seen = self._search.fits(new, old, pose)
-        if seen < _SEEN:
+        if seen < _SEEN or old.cell_m != new.cell_m:
             return
         self._denials = self._denials + 1 if fitting < _DENIED else 0
         if self._denials >= _DENIALS:

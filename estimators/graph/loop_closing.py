@@ -25,6 +25,8 @@ from scipy.special import chdtri
 
 from estimators.gaussian import Gaussian
 from estimators.graph.place_search import (
+    CELL_M,
+    WIDE_CELL_M,
     Patch,
     agreement,
     find_places,
@@ -47,6 +49,7 @@ _MIN_FIT = 0.45  # share of a patch's points that must lie on walls of the other
 _MIN_AGREEMENT, _MIN_SEEN = 0.75, 0.4  # of what both could see; and how much that must be
 _AHEAD = 0.9  # the second best place must have less than this share of the best one's score
 _KEPT_PATCHES, _BENT = 100, 0.1  # m and rad, of key frames within a patch
+_LEAST_SEEN = 60  # points of a patch; with fewer, farther beams are drawn too
 _NEIGHBOURS = 8  # key frames either way
 _SAME_M, _SAME_RAD = 0.15, 0.05  # closures that miss the graph alike
 
@@ -88,7 +91,7 @@ class Patches:
 
     def __init__(self, mount: Array) -> None:
         self.key_frames: list[Seen] = []
-        self._mount = mount
+        self._mount, self._cell_m = mount, CELL_M
         self._drawn: dict[int, tuple[Patch, Array]] = {}
 
     @property
@@ -142,7 +145,14 @@ class Patches:
     def _draw(self, members: Ints, poses: Array) -> Patch:
         scans = [self.key_frames[i].scan for i in members.tolist()]
         seen = [np.zeros((0, 2)) if scan is None else scan.points for scan in scans]
-        return make_patch(poses, seen, self._mount)
+        patch = make_patch(poses, seen, self._mount, self._cell_m)
+        if len(patch.points) < _LEAST_SEEN and self._cell_m < WIDE_CELL_M and len(members) > 1:
+            wide = make_patch(poses, seen, self._mount, WIDE_CELL_M)
+            if len(wide.points) >= _LEAST_SEEN:  # a hall: from now on all are drawn so
+                self._cell_m = WIDE_CELL_M
+                self._drawn.clear()
+                return wide
+        return patch
 
 
 @dataclass(frozen=True)
@@ -200,6 +210,8 @@ class LoopSearch:
         for anchor, mean, P in zip(anchors.tolist(), motions, covariances, strict=True):
             expected = Gaussian(mean, P + np.diag([0.01, 0.01, 1e-4]))
             old = patches.old(graph, anchor)
+            if old.cell_m != new.cell_m:
+                return None  # this is where the cells become wider
             for place in find_places(new, old, expected, self.how.loop_reach_m, _MIN_FIT):
                 fitting, seen = agreement(new, old, place.pose)
                 if fitting > _MIN_AGREEMENT and seen > _MIN_SEEN:
@@ -219,7 +231,7 @@ class LoopSearch:
 
     def on_path(self, path: Patch, scan: PreparedScan, expected: Gaussian) -> Gaussian | None:
         """Pose of a scan in the frame of a patch, near where it is expected; None if unclear."""
-        new = make_patch(np.zeros((1, 3)), [scan.points], self.laser.mount.pose)
+        new = make_patch(np.zeros((1, 3)), [scan.points], self.laser.mount.pose, path.cell_m)
         found = find_places(new, path, expected, self.how.loop_reach_m, _MIN_FIT)
         if not found or (len(found) > 1 and found[1].score > _AHEAD * found[0].score):
             return None

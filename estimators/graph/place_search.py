@@ -20,13 +20,14 @@ from sim import se2
 from sim.arrays import Array, Ints, Values
 from sim.compiled import njit
 
-CELL_M = 0.1
-_SPREAD_M = 0.12  # of a wall, as drawn
-_RANGE_M = 12.0  # beams beyond are not drawn
+CELL_M, WIDE_CELL_M = 0.1, 0.25  # the latter in halls, where little is near
+_SPREAD_CELLS = 1.2  # of a wall, as drawn
+_RANGE_CELLS = 120  # beams beyond are not drawn
 _LEVELS = 6
-_HALF = int(1.25 * _RANGE_M / CELL_M) + 2 ** (_LEVELS - 1)  # cells either way
+_HALF = int(1.25 * _RANGE_CELLS) + 2 ** (_LEVELS - 1)  # cells either way
 _SPACING_M = 0.2  # between the points of a patch
 _MOST_POINTS = 160  # of them, that are compared
+_MIN_POINTS = 40  # of each patch that must lie on walls of the other
 _TURN_RAD = 0.015  # between two headings
 _GATE_SQUARED = 16.3  # Mahalanobis, 3 degrees of freedom, 99.9 %
 _BY_PRIOR = 0.01  # share of the score that a pose loses per squared Mahalanobis distance
@@ -46,12 +47,15 @@ class Patch(NamedTuple):
         (6, N, N) uint8 where walls are, and the pyramid of its maxima, the key frame in the middle.
     free
         (N, N) whether a beam went through.
+    cell_m
+        Side of a cell.
     """
 
     points: Array
     origins: Array
     levels: Values
     free: Values
+    cell_m: float
 
 
 class Place(NamedTuple):
@@ -61,7 +65,7 @@ class Place(NamedTuple):
     score: float
 
 
-def make_patch(poses: Array, seen: list[Array], mount: Array) -> Patch:
+def make_patch(poses: Array, seen: list[Array], mount: Array, cell_m: float = CELL_M) -> Patch:
     """Patch in the frame in which the key frames' poses (M, 3) are given.
 
     Parameters
@@ -73,15 +77,15 @@ def make_patch(poses: Array, seen: list[Array], mount: Array) -> Patch:
     """
     points, origins = [np.zeros((0, 2))], [np.zeros((0, 2))]
     for pose, local in zip(se2.compose(poses, mount), seen, strict=True):
-        near = local[np.hypot(local[:, 0], local[:, 1]) < _RANGE_M]
+        near = local[np.hypot(local[:, 0], local[:, 1]) < _RANGE_CELLS * cell_m]
         points.append(se2.transform(pose, near))
         origins.append(np.tile(pose[:2], (len(near), 1)))
     all_points, all_origins = np.concatenate(points), np.concatenate(origins)
     cells = np.floor(all_points / _SPACING_M).astype(np.int64)
     _, first = np.unique(cells[:, 0] * 100_003 + cells[:, 1], return_index=True)
     first.sort()
-    field, free = _draw(all_points, all_points[first], all_origins[first])
-    return Patch(all_points[first], all_origins[first], _pyramid(field), free)
+    field, free = _draw(all_points, all_points[first], all_origins[first], cell_m)
+    return Patch(all_points[first], all_origins[first], _pyramid(field), free, cell_m)
 
 
 def find_places(
@@ -106,18 +110,18 @@ def find_places(
     sigma = np.sqrt(np.diag(expected.covariance)) * math.sqrt(_GATE_SQUARED)
     half = min(sigma[2], _MOST_TURN_RAD)
     turns = expected.mean[2] + np.linspace(-half, half, 2 * math.ceil(half / _TURN_RAD) + 1)
-    low = np.maximum(expected.mean[:2] - sigma[:2] - CELL_M, -reach_m)
-    high = np.minimum(expected.mean[:2] + sigma[:2] + CELL_M, reach_m)
+    low = np.maximum(expected.mean[:2] - sigma[:2] - old.cell_m, -reach_m)
+    high = np.minimum(expected.mean[:2] + sigma[:2] + old.cell_m, reach_m)
     if (low >= high).any():
         return []
-    box = np.concatenate([np.floor(low / CELL_M), np.ceil(high / CELL_M)]).astype(np.int64)
+    box = np.concatenate([np.floor(low / old.cell_m), np.ceil(high / old.cell_m)]).astype(np.int64)
     information = np.linalg.inv(expected.covariance)
     found: list[Place] = []
     elsewhere = np.full(3, np.inf)
     for least in (floor, None):
         bound = floor if least is not None else 0.8 * found[0].score
         score, x, y, k = _search(
-            old.levels, points, turns, box, expected.mean, information, bound, elsewhere
+            old.levels, old.cell_m, points, turns, box, expected.mean, information, bound, elsewhere
         )
         if k < 0:
             break
@@ -131,10 +135,14 @@ def agreement(new: Patch, old: Patch, pose: Array) -> tuple[float, float]:
 
     The pose (3,) is that of the new patch in the frame of the old.
     """
-    hits, denied = _tally(old.levels[0], old.free, se2.transform(pose, new.points))
-    more, against = _tally(new.levels[0], new.free, se2.transform(se2.inverse(pose), old.points))
+    hits, denied = _tally(old.levels[0], old.free, old.cell_m, se2.transform(pose, new.points))
+    more, against = _tally(
+        new.levels[0], new.free, new.cell_m, se2.transform(se2.inverse(pose), old.points)
+    )
     known = hits + denied + more + against
     total = len(new.points) + len(old.points)
+    if min(hits, more) < _MIN_POINTS:
+        return 0.0, 0.0
     fitting = min(hits / max(hits + denied, 1), more / max(more + against, 1))
     return fitting, known / max(total, 1)
 
@@ -145,14 +153,14 @@ def refine(new: Patch, old: Patch, pose: Array) -> Gaussian:
     Gauss-Newton on the walls as drawn (Kohlbrecher et al., SSRR 2011). Neighbouring points share
     what walls and drawing err by, so the covariance is that of a quarter of them.
     """
-    found, H = _climb(old.levels[0], new.points, pose.copy())
+    found, H = _climb(old.levels[0], old.cell_m, new.points, pose.copy())
     least = np.diag(np.square([_SIGMA_M, _SIGMA_M, _SIGMA_RAD]))
     covariance = 4.0 * _MISFIT * np.linalg.inv(H + np.diag([0.01, 0.01, 0.01]))
     return Gaussian(found, covariance + least)
 
 
 @njit(error_model="numpy")
-def _climb(field: Values, points: Array, pose: Array) -> tuple[Array, Array]:
+def _climb(field: Values, cell_m: float, points: Array, pose: Array) -> tuple[Array, Array]:
     """The pose after a few steps, and its normal matrix."""
     n, H = len(field), np.zeros((3, 3))
     start = pose.copy()
@@ -162,8 +170,8 @@ def _climb(field: Values, points: Array, pose: Array) -> tuple[Array, Array]:
         for k in range(len(points)):
             qx = cos * points[k, 0] - sin * points[k, 1]
             qy = sin * points[k, 0] + cos * points[k, 1]
-            u = (qx + pose[0]) / CELL_M + _HALF - 0.5
-            v = (qy + pose[1]) / CELL_M + _HALF - 0.5
+            u = (qx + pose[0]) / cell_m + _HALF - 0.5
+            v = (qy + pose[1]) / cell_m + _HALF - 0.5
             c, r = math.floor(u), math.floor(v)
             if not (0 <= c < n - 1 and 0 <= r < n - 1):
                 continue
@@ -173,8 +181,8 @@ def _climb(field: Values, points: Array, pose: Array) -> tuple[Array, Array]:
             value = (1 - b) * ((1 - a) * m00 + a * m01) + b * ((1 - a) * m10 + a * m11)
             if value == 0.0:
                 continue
-            dx = ((1 - b) * (m01 - m00) + b * (m11 - m10)) / CELL_M
-            dy = ((1 - a) * (m10 - m00) + a * (m11 - m01)) / CELL_M
+            dx = ((1 - b) * (m01 - m00) + b * (m11 - m10)) / cell_m
+            dy = ((1 - a) * (m10 - m00) + a * (m11 - m01)) / cell_m
             J = (dx, dy, dy * qx - dx * qy)
             for i in range(3):
                 g[i] += J[i] * (1.0 - value)
@@ -190,7 +198,7 @@ def _climb(field: Values, points: Array, pose: Array) -> tuple[Array, Array]:
 
 
 @njit(error_model="numpy")
-def _draw(points: Array, ends: Array, origins: Array) -> tuple[Values, Values]:
+def _draw(points: Array, ends: Array, origins: Array, cell_m: float) -> tuple[Values, Values]:
     """Walls (N, N) uint8, and whether beams went through."""
     n = 2 * _HALF
     field, free = np.zeros((n, n), np.uint8), np.zeros((n, n), np.uint8)
@@ -198,22 +206,22 @@ def _draw(points: Array, ends: Array, origins: Array) -> tuple[Values, Values]:
     for k in range(len(ends)):
         dx, dy = ends[k, 0] - origins[k, 0], ends[k, 1] - origins[k, 1]
         length = math.hypot(dx, dy)
-        steps = int((length - 2.0 * CELL_M) / CELL_M)
+        steps = int((length - 2.0 * cell_m) / cell_m)
         for s in range(steps):
-            part = s * CELL_M / length
-            c = math.floor((origins[k, 0] + part * dx) / CELL_M) + _HALF
-            r = math.floor((origins[k, 1] + part * dy) / CELL_M) + _HALF
+            part = s * cell_m / length
+            c = math.floor((origins[k, 0] + part * dx) / cell_m) + _HALF
+            r = math.floor((origins[k, 1] + part * dy) / cell_m) + _HALF
             if rim <= c < n - rim and rim <= r < n - rim:
                 free[r, c] = 1
     for k in range(len(points)):
-        x, y = points[k, 0] / CELL_M + _HALF, points[k, 1] / CELL_M + _HALF
+        x, y = points[k, 0] / cell_m + _HALF, points[k, 1] / cell_m + _HALF
         c0, r0 = math.floor(x), math.floor(y)
         if not (rim <= c0 < n - rim and rim <= r0 < n - rim):
             continue
         for r in range(r0 - 2, r0 + 3):
             for c in range(c0 - 2, c0 + 3):
-                d2 = ((c + 0.5 - x) ** 2 + (r + 0.5 - y) ** 2) * CELL_M**2
-                value = np.uint8(255.0 * math.exp(-0.5 * d2 / _SPREAD_M**2))
+                d2 = (c + 0.5 - x) ** 2 + (r + 0.5 - y) ** 2
+                value = np.uint8(255.0 * math.exp(-0.5 * d2 / _SPREAD_CELLS**2))
                 if value > field[r, c]:
                     field[r, c] = value
     return field, free
@@ -248,7 +256,7 @@ def _score(level: Values, cells: Ints, x: int, y: int) -> float:
 
 @njit(error_model="numpy")
 def _search(
-    levels: Values, points: Array, turns: Array, box: Ints, mean: Array, information: Array,
+    levels: Values, cell_m: float, points: Array, turns: Array, box: Ints, mean: Array, information: Array,
     floor: float, elsewhere: Array,
 ) -> tuple[float, float, float, int]:  # fmt: skip
     """The best score above a floor, its place x, y, m, and its heading's number, or -1."""
@@ -258,8 +266,8 @@ def _search(
         for k in range(len(points)):
             x = cos * points[k, 0] - sin * points[k, 1]
             y = sin * points[k, 0] + cos * points[k, 1]
-            cells[t, k, 0] = math.floor(x / CELL_M) + _HALF
-            cells[t, k, 1] = math.floor(y / CELL_M) + _HALF
+            cells[t, k, 0] = math.floor(x / cell_m) + _HALF
+            cells[t, k, 1] = math.floor(y / cell_m) + _HALF
     top = len(levels) - 1
     while top > 0 and 2**top > max(box[2] - box[0], box[3] - box[1]):
         top -= 1
@@ -292,7 +300,7 @@ def _search(
             for child in children:
                 roots.append(child)
             continue
-        px, py = x * CELL_M, y * CELL_M
+        px, py = x * cell_m, y * cell_m
         a, b, c = px - mean[0], py - mean[1], turns[t] - mean[2]
         squared = information[0, 0] * a * a + information[1, 1] * b * b
         squared += information[2, 2] * c * c + 2.0 * information[0, 1] * a * b
@@ -306,12 +314,12 @@ def _search(
 
 
 @njit(error_model="numpy")
-def _tally(field: Values, free: Values, points: Array) -> tuple[int, int]:
+def _tally(field: Values, free: Values, cell_m: float, points: Array) -> tuple[int, int]:
     """How many of these points are on walls, and how many in free space."""
     n, hits, denied = len(field), 0, 0
     for k in range(len(points)):
-        c = math.floor(points[k, 0] / CELL_M) + _HALF
-        r = math.floor(points[k, 1] / CELL_M) + _HALF
+        c = math.floor(points[k, 0] / cell_m) + _HALF
+        r = math.floor(points[k, 1] / cell_m) + _HALF
         if 0 <= c < n and 0 <= r < n:
             if field[r, c] > 0:
                 hits += 1
