@@ -31,6 +31,7 @@ from estimators.base import Belief, Estimate, Prior
 from estimators.gaussian import STILL, Gaussian, stack
 from estimators.graph.landmark_drive import FLOOR, loosen
 from estimators.graph.loop_closing import (
+    SLACK,
     LoopOptions,
     LoopSearch,
     Patches,
@@ -65,6 +66,7 @@ _FLOOR_SIGMA, _FLOOR_SHARE = 0.02, 0.1  # of wheels that scans deny: m and rad; 
 # hall of tables and chairs, by 0.2 m
 _LEAST_OVERLAP, _OVERLAP, _WRONG = 0.7, 0.8, np.diag(np.square([0.3, 0.3, 0.06]))
 _DENIED, _SEEN, _DENIALS = 0.5, 0.3, 4  # share that fits, and is seen; checks in a row
+_FINE = np.diag(np.square([0.03, 0.03, 0.01]))  # what finish looks for, whatever the graph claims
 _MISFIT_M, _MISFIT_RAD, _HELD_BY_M = 0.08, 0.025, 3.0  # closures that others replace
 _WITHDRAWN = 2.0  # times robust_sigma, by which a closure misses the graph that lets go of it
 _ONLINE_TOLERANCE = 1e-4  # of a solution that the next closure refines
@@ -400,7 +402,7 @@ class GraphSlam(GraphSlamOptions):
             if len(nodes):
                 motions, covariances = graph.seen_from(nodes, node)
                 sure = np.array([certain(P) for P in covariances])
-                found += self._closures(node, nodes[sure], motions[sure], covariances[sure])
+                found += self._closures(node, nodes[sure], motions[sure], covariances[sure] + _FINE)
         return self._search.supported(graph, [*graph.closures, *found], found)
 
     def _closures(self, node: int, nodes: Ints, motions: Array, covariances: Array) -> list[Edge]:
@@ -430,7 +432,8 @@ class GraphSlam(GraphSlamOptions):
             return None
         off = se2.difference(found.motion.mean, expected.mean)
         noise = found.motion.covariance
-        if not within_gate(off, expected.covariance + noise, self.loop_gate_probability):
+        spread = expected.covariance + noise + SLACK
+        if not within_gate(off, spread, self.loop_gate_probability):
             return None
         if min_gain is None and not self._search.worthwhile(expected.covariance, noise):
             return None

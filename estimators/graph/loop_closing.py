@@ -49,6 +49,8 @@ _MIN_FIT = 0.45  # share of a patch's points that must lie on walls of the other
 _MIN_AGREEMENT, _MIN_SEEN = 0.75, 0.4  # of what both could see; and how much that must be
 _AHEAD = 0.9  # the second best place must have less than this share of the best one's score
 _KEPT_PATCHES, _BENT = 100, 0.1  # m and rad, of key frames within a patch
+# That a chain of registrations may be off by, beyond what it claims, and all closures of it alike
+SLACK = np.diag(np.square([0.15, 0.15, 0.04]))
 _LEAST_SEEN = 60  # points of a patch; with fewer, farther beams are drawn too
 _NEIGHBOURS = 8  # key frames either way
 _SAME_M, _SAME_RAD = 0.15, 0.05  # closures that miss the graph alike
@@ -208,7 +210,7 @@ class LoopSearch:
         new = patches.new(graph, node)
         found: list[tuple[float, int, Array]] = []
         for anchor, mean, P in zip(anchors.tolist(), motions, covariances, strict=True):
-            expected = Gaussian(mean, P + np.diag([0.01, 0.01, 1e-4]))
+            expected = Gaussian(mean, P + SLACK)
             old = patches.old(graph, anchor)
             if old.cell_m != new.cell_m:
                 return None  # this is where the cells become wider
@@ -268,6 +270,7 @@ class LoopSearch:
         """
         off, S = graph.joint_innovation(edges)
         k = len(edges)
+        S += np.tile(SLACK, (k, k))
         agree = np.empty((k, k), dtype=bool)
         for a in range(k):
             for b in range(a + 1):

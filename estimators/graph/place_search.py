@@ -256,8 +256,8 @@ def _score(level: Values, cells: Ints, x: int, y: int) -> float:
 
 @njit(error_model="numpy")
 def _search(
-    levels: Values, cell_m: float, points: Array, turns: Array, box: Ints, mean: Array, information: Array,
-    floor: float, elsewhere: Array,
+    levels: Values, cell_m: float, points: Array, turns: Array, box: Ints, mean: Array,
+    information: Array, floor: float, elsewhere: Array,
 ) -> tuple[float, float, float, int]:  # fmt: skip
     """The best score above a floor, its place x, y, m, and its heading's number, or -1."""
     cells = np.empty((len(turns), len(points), 2), np.int64)
