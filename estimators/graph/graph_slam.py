@@ -2,12 +2,16 @@
 
 The nodes are key frames, taken by distance and turn (lu1997, grisetti2010). Consecutive ones are
 tied by the wheels and by the registration of their scans, others by closures
-(`estimators.graph.loop_closing`). After each set of closures that is believed, all poses x minimise
+(`estimators.graph.loop_closing`). What wheels and registrations are believed to err by follows from
+how they disagree (`estimators.graph.residual_noise`), so that no option is needed for another robot
+or building. After each set of closures that is believed, all poses x minimise
 
     |x_0 - m|^2_P + sum |between(x_i, x_j) - z_ij|^2_R + sum over closures rho(|...|^2_R),
 
-with rho the bounded loss of dynamic covariance scaling (`estimators.graph.least_squares`). `finish`
-registers all key frames that the solved graph shows to be near each other, and solves again.
+with rho the bounded loss of dynamic covariance scaling (`estimators.graph.least_squares`). A
+closure is withdrawn when the others deny it, and a loop when the path since then does not fit the
+map that it made. `finish` registers all key frames that the solved graph shows to be near each
+other, and solves again.
 
 As in `estimators.laser.ekf_icp` each scan is modelled as seen from an apparent pose, whose error
 enters all its registrations. The nodes are the apparent poses: between them registrations have the
@@ -61,7 +65,7 @@ _HELD_M, _MOST_HELD = 15.0, 24  # how long closures wait for others, of path; an
 _CONSIDERED = 8  # times the candidates whose uncertainty is looked at closely
 _SEARCH_M = 1.0  # of path between two searches for places, and two checks of the map
 _MOST_ANCHORS = 80
-_FLOOR_SIGMA, _FLOOR_SHARE = 0.02, 0.1  # of wheels that scans deny: m and rad; and of the way
+_FLOOR_SIGMA, _FLOOR_SHARE = 0.02, 0.05  # of wheels that scans deny: m and rad; and of the way
 # Of scans that share little, some are registered wrongly: a tenth of those that share 0.65 in a
 # hall of tables and chairs, by 0.2 m
 _LEAST_OVERLAP, _OVERLAP, _WRONG = 0.7, 0.8, np.diag(np.square([0.3, 0.3, 0.06]))
@@ -88,9 +92,9 @@ class GraphSlamOptions(EncoderTickOptions, KeyFrameOptions, MatcherOptions, Loop
     max_gap_m: Positive | None = 1.5
     """Leave out a line of which no three points in a row lie this near each other, m: door posts
     far behind one another do not make a wall. null: all lines are kept."""
-    gate_probability: Probability | None = 1e-9
-    """Leave a registration with the key frame out if only this share of all should differ more from
-    what the wheels say, which are never trusted beyond a tenth of the way; null: all are used."""
+    gate_probability: Probability | None = 1e-6
+    """Leave a registration out if only this share of all should differ more from what the wheels say,
+    which are never trusted beyond a twentieth of the way; null: all are used."""
     shared_noise: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.75
     """Share of a registration's covariance that comes from the scans' own errors, half from
     each."""
@@ -263,10 +267,14 @@ class GraphSlam(GraphSlamOptions):
         """Whether a registration differs from what was expected by no more than it may."""
         if self.gate_probability is None or not len(found.held):
             return True
-        off = found.held @ se2.difference(found.motion.mean, self._in_key.mean)
-        expected = self._in_key.covariance + self._doubt()
-        spread = found.held @ (found.motion.covariance + expected) @ found.held.T
-        return within_gate(off, spread, self.gate_probability)
+        # against the wheels since the key frame too: a person who walks along with the robot drags
+        # one registration after the other a little
+        for expected in (self._in_key, self._noise.corrected(self._by_wheels)):
+            off = found.held @ se2.difference(found.motion.mean, expected.mean)
+            spread = found.motion.covariance + expected.covariance + self._doubt()
+            if not within_gate(off, found.held @ spread @ found.held.T, self.gate_probability):
+                return False
+        return True
 
     def _doubt(self) -> Array:
         """Covariance (3, 3) below which wheels are not trusted where scans deny them."""

@@ -51,7 +51,7 @@ class ResidualNoise:
         """Take in a motion by wheels, as logged, and as registered."""
         off = se2.difference(registered.mean, by_wheels.mean)
         believed = np.diag(by_wheels.covariance), np.diag(registered.covariance)
-        self._wheels.append(np.array([off, by_wheels.mean, *believed]))
+        self._wheels.append(np.array([off, registered.mean, *believed]))
         off, motions, own, others = np.array(self._wheels).transpose(1, 0, 2)
         by = motions[:, [0, 2]]
         own, others = np.maximum(own.mean(axis=0), 1e-12), others.mean(axis=0)
