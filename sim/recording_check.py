@@ -38,6 +38,12 @@ def check_recording(recording: Any) -> None:
         if truth.people is not None:
             n_people = truth.people.shape[1] if truth.people.ndim == 3 else 0
             _check_numbers(truth.people, (n, n_people, 3), "truth.people")
+    first, last = recording.frame_stamps[[0, -1]]
+    bare_s = max(wheels.stamps[0] - first, last - wheels.stamps[-1])
+    require(
+        bare_s <= np.diff(wheels.stamps).max(initial=0.0),
+        f"wheels.stamps leave {bare_s:g} s of its Frames without a reading",
+    )
     for name, log in recording.logs.items():
         _check_stamps(log.stamps, f"{name}.stamps", least=0)
         sensor = recording.sensors[name]
@@ -47,6 +53,10 @@ def check_recording(recording: Any) -> None:
             f"the readings of {name} are not those of its settings: they hold {_said(log.schema)}, "
             f"not {_said(expected)}",
         )
+        unseen = np.setdiff1d(log.stamps, recording.frame_stamps)
+        unseen = unseen[(unseen > first) & (unseen < last)]
+        for stamp in unseen[:1]:
+            raise InputError(f"{name} has a reading at {stamp} s, and no Frame is then")
     _check_texts(recording)
 
 

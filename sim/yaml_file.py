@@ -1,6 +1,7 @@
 """YAML files that may come from anywhere: read within bounds, and no key twice."""
 
 import math
+import re
 from pathlib import Path
 from typing import Any
 
@@ -82,6 +83,9 @@ def _check(root: yaml.Node, path: Path) -> None:
         node, depth = nodes.pop()
         seen += 1
         line = f"{path}:{node.start_mark.line + 1}"
+        if isinstance(node, yaml.ScalarNode):  # which names of files may not hold
+            odd = re.search("[\0\ud800-\udfff]", node.value)
+            require(odd is None, f"{line}: holds a zero byte or half a character; remove it")
         require(depth <= _MOST_DEPTH, f"{line}: nested more than {_MOST_DEPTH} deep")
         require(
             seen <= _MOST_NODES, f"{line}: its aliases (*) stand for more than {_MOST_NODES} values"

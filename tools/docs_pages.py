@@ -68,8 +68,13 @@ def _commands() -> Iterator[str]:
     import typer
 
     yield "# Commands\n\nMade from the program's own help: `estima COMMAND --help` says the same.\n"
-    group = typer.main.get_command(app)
-    for name, command in group.commands.items():  # type: ignore[attr-defined]
+    commands = dict[str, Any](vars(typer.main.get_command(app))["commands"])
+    for name, group in list(commands.items()):
+        inside = vars(group).get("commands", {})
+        if inside:
+            commands |= {f"{name} {each}": command for each, command in inside.items()}
+            del commands[name]
+    for name, command in commands.items():
         about, _, examples = inspect.cleandoc(command.help or "").partition("\nExamples\n")
         about, _, example = about.partition("\nExample: ")
         lines = [line.strip() for line in examples.partition("\n")[2].splitlines() if line.strip()]

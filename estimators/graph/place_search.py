@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from estimators.gaussian import Gaussian
+from estimators.graph.matrices import inverse
 from sim import se2
 from sim.arrays import Array, Ints, Values
 from sim.compiled import njit
@@ -115,7 +116,7 @@ def find_places(
     if (low >= high).any():
         return []
     box = np.concatenate([np.floor(low / old.cell_m), np.ceil(high / old.cell_m)]).astype(np.int64)
-    information = np.linalg.inv(expected.covariance)
+    information = inverse(expected.covariance)
     found: list[Place] = []
     elsewhere = np.full(3, np.inf)
     for least in (floor, None):

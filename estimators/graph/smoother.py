@@ -1,4 +1,4 @@
-"""Batch least squares over a whole run: the bound that an online estimate is held against.
+"""Batch least squares over a whole run: the baseline that online estimates are held against.
 
 Poses, odometry increments and stereo landmarks with known ids make one non-linear least-squares
 problem, which `estimators.graph.least_squares` solves.

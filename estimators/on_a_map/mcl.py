@@ -201,8 +201,9 @@ class Mcl(MclOptions):
     The mean is that of the hypothesis (particles within 1 m and 0.5 rad) of greatest weight; the
     covariance is that of all particles about it, so it shows whether there are others. Extras, of
     the last scan used: `particles` (M, 3), `log_weights` (M,), `ess`, `hypothesis_weight`,
-    `fit`, the likelihood of a beam at the best particle, and `injected`, the number of particles
-    injected, those of rivals that became the belief included; `status` when a scan saw nothing.
+    `fit`, the likelihood of a beam at the best particle, `lost`, 1 less the product of these two,
+    and `injected`, the number of particles injected, those of rivals that became the belief
+    included; `status` when a scan saw nothing.
     """
 
     needs = frozenset({"laser", "map"})
@@ -321,6 +322,7 @@ class Mcl(MclOptions):
         """
         fit = math.exp(float(np.max(of_scan)) / n_beams)
         self._extras["fit"] = fit
+        self._extras["lost"] = 1.0 - fit * self._extras["hypothesis_weight"]
         if self.recovery != "average" or self.alpha_slow == 0.0:
             return 0.0
         self._slow += self.alpha_slow * (fit - self._slow)
@@ -415,6 +417,7 @@ class Mcl(MclOptions):
             "log_weights": self._log_weights,
             "ess": effective_sample_size(self._log_weights),
             "hypothesis_weight": held,
+            "lost": self._extras.get("lost", float(self._everywhere)),
             "injected": 0,
         }
         return Gaussian(mean, (covariance + covariance.T) / 2.0)

@@ -131,10 +131,10 @@ class External(ExternalOptions):
     def _numbers(self, answer: dict[str, Any], key: str, shape: tuple[int, ...]) -> Array:
         """Numbers of an answer, of a shape."""
         try:
-            found = np.array(answer.get(key))
+            found = np.array(answer.get(key), object)
         except ValueError:  # ragged
             found = np.zeros(0, object)
-        if found.dtype.kind not in "if" or found.shape != shape:
+        if not {int, float}.issuperset(map(type, found.flat)) or found.shape != shape:
             sizes = " x ".join(map(str, shape))
             raise self._wrong(
                 f"must answer with {key}, {sizes} numbers; got {answer.get(key)!r:.60}"

@@ -7,6 +7,7 @@ an earlier revision, runs in turn with the code as it is, and each pair of runs 
 import dataclasses
 import json
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -59,6 +60,16 @@ def git(*words: str, folder: Path | None = None) -> str:
     return ran.stdout.strip()
 
 
+def clone_of(file: Path) -> Path | None:
+    """The clone that a file lies in; None for that of the running code."""
+    if file.resolve().is_relative_to(paths.CONF.resolve()):
+        return None
+    for folder in file.resolve().parents:
+        if (folder / ".git").exists():
+            return folder
+    raise InputError(f"{file}: in no git repository, so its commits cannot be run")
+
+
 def checkout(revision: str, folder: Path | None = None) -> Checkout:
     """Check a revision out into the cache, as a `git worktree`; take the one that is there.
 
@@ -73,14 +84,32 @@ def checkout(revision: str, folder: Path | None = None) -> Checkout:
     if not (place / ".git").exists():
         place.parent.mkdir(parents=True, exist_ok=True)
         git("worktree", "add", "-d", "-f", str(place), commit, folder=folder)
+        _share_compiled(folder or paths.SOURCE, place)
     here, there = ((f / _LOCK) for f in (folder or paths.SOURCE, place))
     if here.exists() and (not there.exists() or here.read_bytes() != there.read_bytes()):
         warn(f"estima: {_LOCK} differs at {revision}; both run in the environment of now")
     return Checkout(place, commit)
 
 
+def _share_compiled(here: Path, there: Path) -> None:
+    """Give a checkout the compiled code of here, if every file that it was compiled from is equal.
+
+    Compiled functions hold those of other files, so one that differs is enough to compile again.
+    """
+    compiled = [p for room in ("sim", "estimators") for p in (here / room).rglob("*.nb[ic]")]
+    sources = {p.parent.parent / f"{p.name.partition('.')[0]}.py" for p in compiled}
+    pairs = [(source, there / source.relative_to(here)) for source in sources]
+    if all(s.exists() and t.exists() and s.read_bytes() == t.read_bytes() for s, t in pairs):
+        for source, copy in pairs:
+            shutil.copystat(source, copy)  # numba compares the time of the last change
+        for path in compiled:
+            copy = there / path.relative_to(here)
+            copy.parent.mkdir(exist_ok=True)
+            shutil.copy2(path, copy)
+
+
 def run_in(folder: Path, script: str, *arguments: str) -> Any:
-    """What a script prints, as JSON, that imports the code of a folder.
+    """What a script prints, as JSON, that imports the code of a folder before that of now.
 
     Raises
     ------
@@ -88,7 +117,8 @@ def run_in(folder: Path, script: str, *arguments: str) -> Any:
         If it fails.
     """
     threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
-    places = {"PYTHONPATH": str(folder), "ESTIMA_RESULTS": str(paths.results())}
+    found = os.pathsep.join(map(str, (folder, paths.SOURCE)))
+    places = {"PYTHONPATH": found, "ESTIMA_RESULTS": str(paths.results())}
     ran = subprocess.run(
         [sys.executable, "-c", script, *arguments],
         cwd=folder,

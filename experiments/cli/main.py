@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from experiments.cli import logs, look, project, run, score, tables
+from experiments.cli import logs, look, project, run, score, submit, tables
 from experiments.cli.flags import PASS_ON
 from experiments.runs.console import exit_with
 from experiments.runs.paths import TRUST
@@ -86,6 +86,7 @@ _COMMANDS: dict[str, Callable[..., None]] = {  # as `estima --help` lists them
     "conform": score.conform,
     "check": project.check,
     "bisect": project.bisect,
+    "history": project.history,
     "bench": project.bench,
     "table": tables.table,
     "plot": tables.plot,
@@ -98,6 +99,7 @@ _COMMANDS: dict[str, Callable[..., None]] = {  # as `estima --help` lists them
 }
 for _name, _command in _COMMANDS.items():
     app.command(_name, context_settings=PASS_ON if _name == "run" else None)(_command)
+app.add_typer(submit.app, name="submit")
 
 
 def main() -> None:

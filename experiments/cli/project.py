@@ -1,4 +1,4 @@
-"""Commands on the project: check, bisect, reproduce, bench, cache."""
+"""Commands on the project: check, bisect, history, reproduce, bench, cache."""
 
 from __future__ import annotations
 
@@ -256,13 +256,62 @@ def bisect(
             autocompletion=completion.estimators,
         ),
     ] = None,
+    config_dir: ConfigDir = None,
 ) -> None:
     """Find the commit that made an estimator's errors worse.
 
-    Every revision that is checked is a worktree in the cache of the results' folder.
+    Every revision that is checked is a worktree in the cache of the results' folder: of Estima's
+    clone, or of the one that your own suite lies in.
 
-    Example: estima bisect v0.2 --only fastslam
+    Examples
+    --------
+      estima bisect v0.2 --only fastslam
+
+      estima bisect HEAD~9 --suite mine.yaml --config-dir mine
     """
     from experiments.gate.bisect import run_bisect
 
-    run_bisect(good, bad, suite, only or [])
+    run_bisect(good, bad, suite, only or [], config_dir)
+
+
+def history(
+    revisions: Annotated[
+        list[str] | None, typer.Argument(help="With --append: git revisions, by default HEAD.")
+    ] = None,
+    append: Annotated[
+        bool, typer.Option("--append", help="Run the suite there, and keep the errors.")
+    ] = False,
+    suite: Annotated[
+        str,
+        typer.Option(
+            help="Suite of conf/suite, or a .yaml file.", autocompletion=completion.suites
+        ),
+    ] = "history",
+    speed: Annotated[
+        str | None,
+        typer.Option(help="With --append: time steps too, in turn with this git revision's."),
+    ] = None,
+    file: Annotated[
+        Path | None,
+        typer.Option(help="The .parquet file; by default among the suite's baselines."),
+    ] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Page to write, .html.")] = None,
+    config_dir: ConfigDir = None,
+) -> None:
+    """Show errors and step times over the commits, and where they changed; or add commits.
+
+    Examples
+    --------
+      estima history
+
+      estima history --append --speed v0.2
+
+      estima history --append HEAD~20 HEAD~10 HEAD
+
+      estima history -o history.html
+    """
+    from experiments.gate.history_page import run_history
+
+    require(append or not (revisions or speed), "revisions and --speed go with --append")
+    added = (revisions or ["HEAD"]) if append else []
+    run_history(suite, added, speed, file, out, config_dir)

@@ -39,6 +39,19 @@ def _rows(name: str, kept: Kept, times: bool) -> DataFrame:
     return where(collect(name, all_versions=kept.all_versions, times=times), kept.only or [])
 
 
+@dataclass(frozen=True)
+class Beside:
+    """What a table shows beside its main results."""
+
+    times: Annotated[bool, typer.Option("--times", help="Keep computing times.")] = False
+    efficiency: Annotated[
+        bool,
+        typer.Option(
+            "--efficiency", help="Errors over the least of any method (docs/do/bound.md)."
+        ),
+    ] = False
+
+
 @gathered
 def table(
     name: Sweep,
@@ -60,7 +73,6 @@ def table(
             autocompletion=completion.metrics,
         ),
     ] = None,
-    times: Annotated[bool, typer.Option("--times", help="Keep computing times.")] = False,
     every: Annotated[
         bool, typer.Option("--rows", help="With -o: write every row, with all its columns.")
     ] = False,
@@ -72,6 +84,7 @@ def table(
         ),
     ] = None,
     *,
+    beside: Beside,
     kept: Kept,
 ) -> None:
     """Show a sweep's mean errors with 95 % intervals, or write them for a paper.
@@ -95,12 +108,14 @@ def table(
     require(not every or out is not None, "--rows: name the file to write, such as -o rows.csv")
     known = not every or out is None or out.suffix in (".csv", ".parquet")
     require(known, f"-o {out}: with --rows it is .csv or .parquet")
-    timed = times or any(column.endswith("_time_us") for column in metric or [])
+    timed = beside.times or any(column.endswith("_time_us") for column in metric or [])
     rows = _rows(name, kept, timed)
     if every and out is not None:
         show(of_sweep.write_rows(rows, out))
     else:
-        show(of_sweep.table_of(rows, name, out, against, metric or [], size))
+        named = metric or []
+        over = beside.efficiency
+        show(of_sweep.table_of(rows, name, out, against, named, size, efficiency=over))
 
 
 @dataclass(frozen=True)

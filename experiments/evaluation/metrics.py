@@ -14,6 +14,7 @@ from sim.arrays import Array
 from sim.errors import require
 from sim.recording import Recording
 
+_CHI2_3DOF = {50: 2.365973884375338, 90: 6.251388631170325, 95: 7.814727903251179}  # quantiles
 CHI2_95_2DOF = 5.991464547107979  # 95 % quantile of chi-square with two degrees of freedom
 _SINGULAR = 1e-10  # least eigenvalue of a correlation matrix that can be trusted
 RPE_DISTANCES_M = (1.0, 10.0)
@@ -209,6 +210,12 @@ def path_scores(truth: Array, means: Array, covariances: Array) -> dict[str, flo
         row["ellipse_area_final_m2"] = float(ellipse_area_m2(covariances[-1:])[0])
     if counted.any():
         row["nees_mean"] = float(np.mean(values[counted]))
+        row |= {
+            f"inside_{percent}_share": float(np.mean(values[counted] <= most))
+            for percent, most in _CHI2_3DOF.items()
+        }
+        variances = np.diagonal(covariances[counted], axis1=1, axis2=2)
+        row["sharpness_m"] = rms(np.sqrt(variances[:, 0] + variances[:, 1]))
     if row.get("ellipse_area_final_m2", 0.0) > 0.0:
         row["final_in_ellipse"] = float(in_ellipse(truth[-1], means[-1], covariances[-1]))
     for distance in RPE_DISTANCES_M:

@@ -47,6 +47,36 @@ def share_interval(hits: int, trials: int) -> Interval:
     return Interval(hits / trials, float(bounds.low), float(bounds.high))
 
 
+BELOW_BOUND = 1e-3  # P below which errors are too small to come from an honest method
+
+
+def over_bound(squares: ArrayLike, least: ArrayLike) -> tuple[Interval, float]:
+    """Pooled RMS error of recordings over the pooled least one.
+
+    The errors of a recording count as the multiples of one normal variable: of all quadratic forms
+    of normal errors it has the widest spread, so the interval is too wide rather than too narrow,
+    and P too great.
+
+    Parameters
+    ----------
+    squares, least
+        (N,) mean squared error of each recording, and the least that can be expected.
+
+    Returns
+    -------
+    tuple
+        The ratio, and the P of one so small or smaller by a method that is at the bound.
+    """
+    errors, bounds = np.asarray(squares, float), np.asarray(least, float)
+    if not bounds.sum() > 0.0:
+        return Interval(math.nan, math.nan, math.nan), math.nan
+    ratio, dof = errors.sum() / bounds.sum(), bounds.sum() ** 2 / np.square(bounds).sum()
+    low, high = np.sqrt(ratio * dof / stats.chi2.ppf([0.975, 0.025], dof))
+    return Interval(math.sqrt(ratio), float(low), float(high)), float(
+        stats.chi2.cdf(dof * ratio, dof)
+    )
+
+
 def bootstrap_interval(
     clusters: ArrayLike,
     statistic: Callable[[Array], float],

@@ -5,7 +5,6 @@ in between is then placed on the side of the end that it is nearer to, over the 
 streams. Where chance leaves that open, all three run again with other streams.
 """
 
-import json
 import math
 import re
 from collections.abc import Callable, Sequence
@@ -17,24 +16,16 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
-from experiments.bench.against import checkout, git, run_in
+from experiments.bench.against import checkout, clone_of, git
 from experiments.gate.compare import Change, Finding, by_repeat, compare, failed_runs
 from experiments.gate.report import sentence
+from experiments.gate.revision import rows_in
 from experiments.gate.suite import read_suite, suite_path
 from experiments.runs.console import show, warn
 from sim.errors import InputError, printable, require
 
 SURE = 3.3  # standard errors from the middle; the side is wrong in 1 of 2000 cases
 MAX_SEEDINGS = 6
-_ROWS = """
-import json, sys
-from pathlib import Path
-from experiments.gate.suite import read_suite, run_suite
-path, names, reseed = json.loads(sys.argv[1])
-suite = read_suite(Path(path)).select(names)
-repeats = {entry.name: entry.repeats[0] for entry in suite.estimators if not entry.elsewhere}
-print(run_suite(suite, repeats, reseed=reseed).to_json(orient="records", double_precision=15))
-"""
 Measure = Callable[[str, Sequence[str], int], pd.DataFrame]  # commit, estimators, seeding: rows
 
 
@@ -83,7 +74,13 @@ def find_commit(commits: Sequence[str], measure: Measure, only: Sequence[str] = 
     alarms = [f for f in compare({"accepted": good}, bad) if f.alarms]
     require(alarms, f"nothing is worse at {ends[1]} than at {ends[0]}")
     finding = min(alarms, key=lambda f: (f.verdict is not Change.FAILED, max(_ps(f))))
-    rows = cache(lambda commit, seeding: measure(commit, [finding.estimator], seeding))
+    known = {(ends[0], 0): good, (ends[1], 0): bad}
+
+    @cache
+    def rows(commit: str, seeding: int) -> pd.DataFrame:
+        found = known.get((commit, seeding))
+        return measure(commit, [finding.estimator], seeding) if found is None else found
+
     left, skipped, n_checks, p_wrong = list(commits), set[str](), 2, 0.0
     while len(left) > 2:
         middle = len(left) // 2
@@ -150,7 +147,9 @@ def history(good: str, bad: str, folder: Path | None = None) -> list[str]:
     return commits
 
 
-def run_bisect(good: str, bad: str, suite: str, only: Sequence[str]) -> None:
+def run_bisect(
+    good: str, bad: str, suite: str, only: Sequence[str], config_dir: Path | None = None
+) -> None:
     """Do what `estima bisect` does.
 
     Raises
@@ -159,15 +158,15 @@ def run_bisect(good: str, bad: str, suite: str, only: Sequence[str]) -> None:
         If the history or the suite cannot be used, or nothing is worse.
     """
     path = suite_path(suite).resolve()
-    read_suite(path).select(only)
-    commits = history(good, bad)
+    read_suite(path, config_dir).select(only)
+    clone = clone_of(path)
+    commits = history(good, bad, clone)
 
     def measure(commit: str, names: Sequence[str], seeding: int) -> pd.DataFrame:
         show(f"checking {commit[:12]}")
-        given = json.dumps([str(path), list(names), seeding])
-        return pd.DataFrame(run_in(checkout(commit).folder, _ROWS, given))
+        return rows_in(checkout(commit, clone).folder, path, names, seeding, config_dir)
 
-    show(as_text(find_commit(commits, measure, only)))
+    show(as_text(find_commit(commits, measure, only), clone))
 
 
 def as_text(blame: Blame, folder: Path | None = None) -> str:

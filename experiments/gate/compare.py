@@ -274,7 +274,7 @@ def compare(baselines: dict[str, pd.DataFrame], current: pd.DataFrame) -> list[F
     for name, baseline in baselines.items():
         for estimator, now in current.groupby("estimator", sort=False):
             then = baseline[baseline["estimator"] == estimator]
-            _same_recordings(str(estimator), name, then, now)
+            check_recordings(str(estimator), name, then, now)
             failing = _newly_failing(then, now)
             for error in ERRORS:
                 finding = examine(
@@ -297,7 +297,14 @@ def by_repeat(rows: pd.DataFrame, error: str) -> Array:
     return np.asarray(rows.pivot(index="recording", columns="repeat", values=error), np.float64)
 
 
-def _same_recordings(estimator: str, name: str, then: pd.DataFrame, now: pd.DataFrame) -> None:
+def check_recordings(estimator: str, name: str, then: pd.DataFrame, now: pd.DataFrame) -> None:
+    """Refuse rows that cannot be compared with a baseline's, run by run.
+
+    Raises
+    ------
+    InputError
+        If the baseline has no such estimator, or it ran over other recordings.
+    """
     remedy = "; accept a check with a reason to start a new baseline"
     require(not then.empty, f"the {name} baseline has no {estimator}{remedy}")
     before, after = (

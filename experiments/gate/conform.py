@@ -7,6 +7,7 @@ distribution.
 
 import contextlib
 import dataclasses
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -16,6 +17,8 @@ import yaml
 from omegaconf import OmegaConf
 
 from estimators.base import Estimator, Prior
+from experiments.evaluation.recording_bound import bound_recording
+from experiments.evaluation.statistics import BELOW_BOUND, over_bound
 from experiments.gate.cheats import find_cheats
 from experiments.runs.experiment import Experiment
 from experiments.runs.seeds import stream
@@ -32,6 +35,7 @@ _COS, _SIN = np.cos(MOTION[2]), np.sin(MOTION[2])
 _TURN = np.array([[_COS, -_SIN, 0.0], [_SIN, _COS, 0.0], [0.0, 0.0, 1.0]])
 N_SEEDS = 30  # runs of each arm when compared in distribution
 _GRAIN = np.array([0.05, 0.05, 0.02])  # how far a grid may be off once turned: m, m, rad
+_N_DRIVES = 5  # on which errors below the bound are looked for
 # Recordings to check on, each with a tracking prior and its map
 _ROOM = (
     "world=room",
@@ -283,6 +287,41 @@ def _missing(new: Make, recording: Recording, prior: Prior) -> str:
     return ""
 
 
+def find_below_bound(new: Make, drives: Sequence[tuple[Recording, Prior]]) -> str:
+    """Say whether errors over drives are smaller than any method's that is shown what this needs.
+
+    Sensors that it does not need, and the map, are taken away. Nothing is said where there is no
+    bound, as for a laser without a map.
+    """
+    needs: frozenset[str] = getattr(new(), "needs", frozenset())
+    squares: list[Array] = []
+    named = {getattr(new(), option, option) for need in needs for option in need.split("|")}
+    for given, prior in drives:
+        recording = given
+        for name in set(given.sensors) - named:
+            recording = recording.without(name)
+        shown = prior.map if "map" in needs else None
+        poorer = dataclasses.replace(prior, sensors=recording.sensors, map=shown)
+        least = bound_recording(recording, poorer, recording.sensors)
+        if least is None:
+            return ""
+        try:
+            means, _ = walk(new(), recording, poorer)
+        except InputError:  # it needs more than it says
+            return ""
+        if len(means) != len(least.revised) or not np.isfinite(means).all():
+            return ""
+        off = se2.difference(means, recording.truth_at(recording.frame_stamps))
+        spread = np.diagonal(least.revised, axis1=1, axis2=2)
+        squares.append(np.vstack([off**2, spread]).reshape(2, -1, 3).mean(axis=1))
+    errors, bounds = np.array(squares).transpose(1, 0, 2)
+    for kind, part in (("position", slice(0, 2)), ("heading", slice(2, 3))):
+        ratio, p = over_bound(errors[:, part].sum(axis=1), bounds[:, part].sum(axis=1))
+        if p < BELOW_BOUND:
+            return f"{kind} errors are {ratio.value:.2g} times the least of any honest method"
+    return ""
+
+
 _CHECKS: Mapping[str, Callable[[Make, Recording, Prior], str]] = {
     "finite": _finite,
     "covariance": _covariance,
@@ -317,7 +356,17 @@ def conform_target(
     else:
         new = Experiment.compose([*searched, f"estimator={target}", *arguments]).estimator
     places = "place|lidar3d" in getattr(new(), "needs", ())
-    return check_estimator(new, *example([*searched, *sensors], places=places))
+    results = check_estimator(new, *example([*searched, *sensors], places=places))
+    if places or not all(result.passed for result in results if result.name == "finite"):
+        return results
+    drives = [_drive((*searched, *sensors), seed) for seed in range(_N_DRIVES)]
+    fault = find_below_bound(new, drives)
+    return [*results, CheckResult("not below the bound", not fault, fault or "ok")]
+
+
+@functools.cache
+def _drive(overrides: tuple[str, ...], seed: int) -> tuple[Recording, Prior]:
+    return example([*overrides, f"seed={seed}"])
 
 
 def _of_class(target: str, arguments: Sequence[str]) -> Make:

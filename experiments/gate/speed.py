@@ -43,15 +43,19 @@ def run_speed(
     InputError
         If the suite or the revision cannot be used, or no estimator runs at both.
     """
-    whole = read_suite(suite_path(suite_name), config_dir)
-    runs = commands(whole.select(only).made(elsewhere=False))
-    old = checkout(revision)
-    measure = partial(_step_times, runs)
-    with progress("timing the steps", 1.0) as on_progress:
-        ratios = alternate(measure, paths.SOURCE, old.folder, on_progress=on_progress)
-    require(ratios, f"{revision}: none of {', '.join(runs)} runs there and here")
-    show(as_text(ratios, revision, sorted(set(runs) - set(ratios))))
+    suite = read_suite(suite_path(suite_name), config_dir).select(only).made(elsewhere=False)
+    ratios = step_ratios(suite, paths.SOURCE, checkout(revision).folder)
+    names = [entry.name for entry in suite.estimators]
+    require(ratios, f"{revision}: none of {', '.join(names)} runs there and here")
+    show(as_text(ratios, revision, sorted(set(names) - set(ratios))))
     return bool(slower(ratios))
+
+
+def step_ratios(suite: Suite, new: Path, old: Path) -> dict[str, Interval]:
+    """Processor time of every estimator's step by the code of one folder over another's."""
+    measure = partial(_step_times, commands(suite))
+    with progress("timing the steps", 1.0) as on_progress:
+        return alternate(measure, new, old, on_progress=on_progress)
 
 
 def commands(suite: Suite) -> dict[str, list[str]]:

@@ -15,6 +15,7 @@ OWN = (
     "mcl_office",
     "fastslam_consistency",
     "peers",
+    "self_knowledge",
 )  # our own, which judge no claim: run when named
 STUDIES = (*PAPERS, *LOGS, *NAMED, *OWN)
 ROOMS = tuple(SOURCE / "experiments" / room for room in ("papers", "studies"))

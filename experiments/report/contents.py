@@ -35,7 +35,7 @@ OWN = {
         "estima run -m study=leaderboard",
         "estima plot leaderboard --x choice.estimator --by choice.world "
         "-o results/figures/leaderboard_errors.png",
-        "estima table leaderboard --against smoother --times "
+        "estima table leaderboard --against smoother --times --efficiency "
         "-o results/tables/leaderboard_means.csv",
     ],
     "peers": [
@@ -46,6 +46,7 @@ OWN = {
     "all_estimators": ["estima run -m study=all_estimators"],
     "mcl_office": [reproduce_command("mcl_office")],
     "fastslam_consistency": [reproduce_command("fastslam_consistency")],
+    "self_knowledge": [reproduce_command("self_knowledge")],
 }
 FIRST = (
     "real_logs_building",

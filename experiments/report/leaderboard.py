@@ -10,6 +10,7 @@ import pandas as pd
 
 from experiments.report.export import significant
 from experiments.runs.row import read_rows
+from experiments.sweeps.summary import BELOW
 
 MOST = 8  # methods that the first screen names
 _TUNED = "_tuned"
@@ -21,8 +22,9 @@ def by_world(path: Path) -> dict[str, Any]:
     Returns
     -------
     dict
-        `worlds`; `rows` of the method and a cell (error, whether it is the least) for each world,
-        the best method first, at most `MOST`; `n_methods`. Empty without such a table.
+        `worlds`; `rows` of the method, a cell (error, whether it is the least) for each world, and
+        its errors over the bound, the best method first, at most `MOST`; `n_methods`; whether any
+        is `bounded`. Empty without such a table.
     """
     columns = ["choice.world", "choice.estimator"]
     found = read_rows(path) if path.exists() else pd.DataFrame()
@@ -36,14 +38,28 @@ def by_world(path: Path) -> dict[str, Any]:
         return {}
     order = np.log(errors).mean(axis=1).sort_values(kind="stable").index
     least = errors.min()
+    over = {name: _over_bound(found[found["method"] == name]) for name in order[:MOST]}
     return {
         "worlds": list(errors),
         "rows": [
-            (name, [(significant(e, 2), e == least[w]) for w, e in errors.loc[name].items()])
+            (
+                name,
+                [(significant(e, 2), e == least[w]) for w, e in errors.loc[name].items()],
+                over[name],
+            )
             for name in order[:MOST]
         ],
         "n_methods": len(errors),
+        "bounded": any(over.values()),
     }
+
+
+def _over_bound(rows: pd.DataFrame) -> str:
+    """Position errors over the bound, the geometric mean over worlds, or that it cheats."""
+    if BELOW in rows and (rows[BELOW].fillna("") != "").any():
+        return "below the bound"
+    ratios = rows.get("position_over_bound", pd.Series(dtype=float)).dropna()
+    return significant(float(np.exp(np.log(ratios).mean())), 2) if len(ratios) else ""
 
 
 def on_lasers(path: Path) -> dict[str, Any]:

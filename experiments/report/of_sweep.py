@@ -19,6 +19,7 @@ from experiments.runs.row import Outcome, write_frame
 from experiments.sweeps.again import draw_recorded_run, short_key
 from experiments.sweeps.collect import folder_of, suggest_axes
 from experiments.sweeps.summary import summary
+from experiments.sweeps.winner import find_winner
 from experiments.viewing.play import Showing
 from experiments.viewing.style import save_figure
 from sim.errors import InputError, require
@@ -37,14 +38,18 @@ def table_of(
     against: str | None,
     metrics: Sequence[str],
     size: str | None,
+    *,
+    efficiency: bool = False,
 ) -> str:
     """Mean errors of a sweep as lines, or in a file; then it says how many rows that has."""
-    found = summary(rows, against, metrics)
+    found = summary(rows, against, metrics, efficiency=efficiency)
     note = notes(found, against)
     if out is not None:
         write_table(found, note, out, Path(name).name, size)
         return f"{out}: {pluralize(len(found), 'row')}"
     lines = as_lines(found, note)
+    if not metrics and (winner := find_winner(rows)):
+        lines += "\n\n" + "\n".join(winner.sentences())
     if (rows["status"] != Outcome.OK).any():
         lines += "\n\n" + "\n".join(f"{count} {words}" for words, count in statuses(rows))
     return lines

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from experiments.report.export import setting_texts
-from experiments.runs.columns import ANSWER, COLUMNS, PATH, REPEAT, format_alike, title
+from experiments.runs.columns import ANSWER, COLUMNS, PATH, REPEAT, bound_of, format_alike, title
 from experiments.sweeps.averages import averages, pool_repeats, rule, unit_of
 from experiments.sweeps.collect import (
     DRAWN,
@@ -75,7 +75,7 @@ def sweep_figure(
 
     A y such as `answer_ate_rmse_m` is that of the best answer, the revised path where there is one;
     what gives revised paths is marked so. Means follow the rule of `sweeps.averages`, as those of
-    tables do.
+    tables do. A dotted line is what no method can beat, where rows state it (docs/do/bound.md).
 
     Parameters
     ----------
@@ -101,7 +101,7 @@ def sweep_figure(
     facets = [name for name in (row, col) if name is not None]
     by = [name for name in ([by] if isinstance(by, str) else by or []) if name not in facets]
     if y.startswith(ANSWER):
-        table = _marked(with_answers(table, [y]), [x, *by, *facets])
+        table = _marked(with_answers(table, [y, bound_of(y)]), [x, *by, *facets])
     groups = list(dict.fromkeys([*by, *facets, x]))
     _check(table, y, groups)
     table, left_out = _complete(table, y, groups)
@@ -112,6 +112,8 @@ def sweep_figure(
     unit = unit_of(table, groups)
     over = [c for c in distinguishing_settings(table) if c not in (*groups, *DRAWN)]
     means = averages(table, groups, unit, y, over).reset_index()
+    least = averages(table, groups, unit, bound_of(y), over) if bound_of(y) in table else means[:0]
+    least = least.reset_index()
     unbounded = means.loc[means["low"].isna(), groups]
     dots = pool_repeats(table, [*groups, unit], y, over).reset_index().merge(unbounded, on=groups)
     texts = {name: _texts(means[name]) for name in groups}
@@ -142,6 +144,8 @@ def sweep_figure(
                 color=colour, marker=marker, ms=4, capsize=2, lw=1.2,
                 ls="-" if shown.joined else "none", label=label,
             )  # fmt: skip
+            below = _rows_of(least, {**panel, **line})
+            ax.plot(shown.places(below[x], k, len(lines)), below["value"], ":", color=colour, lw=1)
             at = shown.places(alone[x], k, len(lines))
             ax.plot(at, alone[y], ".", color=colour, ms=4, alpha=0.5)
         words = (_named(name, value, texts[name]) for name, value in panel.items())
@@ -161,6 +165,7 @@ def sweep_figure(
         axes[0, 0].set_ylabel(of_y)
     parts = [
         rule(unit, [y], means["low"].notna(), over),
+        "dotted: the least of any method" if len(least) else "",
         "small dots: both of two" if (dots.groupby(groups).size() > 1).any() else "",
         left_out,
     ]

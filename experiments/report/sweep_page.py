@@ -1,4 +1,4 @@
-"""One self-contained page of a sweep: chart, means, best and worst runs, command."""
+"""One self-contained page of a sweep: answer, chart, means, best and worst runs, command."""
 
 from __future__ import annotations
 
@@ -37,6 +37,7 @@ from experiments.sweeps.collect import (
 from experiments.sweeps.commands import commands, config_dir_option, noted_config_dir
 from experiments.sweeps.summary import ERROR, summary
 from experiments.sweeps.until import read_decided
+from experiments.sweeps.winner import find_winner
 from sim.errors import printable, require
 from sim.files import write_text
 from sim.yaml_file import read_yaml
@@ -101,6 +102,7 @@ def write_sweep_page(
         called=shlex.quote(name),
         n_runs=len(table),
         unfinished=unfinished_sweeps(folder),
+        answer=found_winner.sentences() if (found_winner := find_winner(table)) else [],
         decided=decided and {**decided, "metric": titled(decided["metric"])},
         controls=_controls(every, drawn_by, settings, metrics),
         filters=[
@@ -108,7 +110,7 @@ def write_sweep_page(
             for i, each in enumerate(settings)
             if 2 <= len(each["words"]) <= _FILTERED
         ],
-        data=_as_json(
+        data=as_json(
             {
                 "spec": read_yaml(TEMPLATES / "chart.yaml"),
                 "narrowing": _narrowing(decided),
@@ -248,16 +250,17 @@ def _metric(column: pd.Series[float], name: str, place: Mapping[str, int]) -> di
         "rules": [[rule(unit, [name], some) for some in intervals] for unit in (RECORDING, REPEAT)],
         "log": COLUMNS[name].scale == "log",
         "floor": None if (column < 0.0).any() else 0,
-        "values": None if name.startswith(ANSWER) else _numbers(column),
+        "values": None if name.startswith(ANSWER) else [rounded(v) for v in column],
         "paths": [place.get(path + name.removeprefix(ANSWER)) for path in ("", REVISED)],
     }
 
 
-def _numbers(column: pd.Series[float]) -> list[float | None]:
-    return [float(f"{v:.{_DIGITS}g}") if math.isfinite(v) else None for v in column]
+def rounded(value: float) -> float | None:
+    """A number as the data of a chart hold it; None if it is not finite."""
+    return float(f"{value:.{_DIGITS}g}") if math.isfinite(value) else None
 
 
-def _as_json(found: Mapping[str, Any]) -> Markup:
+def as_json(found: Mapping[str, Any]) -> Markup:
     """JSON that no HTML can end."""
     text = json.dumps(found, allow_nan=False, separators=(",", ":"))
     return Markup(re.sub("[<>&\u2028\u2029]", lambda c: f"\\u{ord(c[0]):04x}", text))

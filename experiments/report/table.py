@@ -21,7 +21,7 @@ from experiments.report.export import (
 from experiments.report.page import render
 from experiments.runs.columns import PATH
 from experiments.runs.row import Outcome, write_frame
-from experiments.sweeps.summary import COUNT_WORDS, COUNTS, MARKS
+from experiments.sweeps.summary import BELOW, COUNT_WORDS, COUNTS, MARKS
 from sim.errors import require
 from sim.files import write_text
 
@@ -73,12 +73,16 @@ def notes(found: pd.DataFrame, against: str | None) -> str:
         parts.append(f"Too few recordings to test what differs from {against}.")
     elif against:
         parts.append(f"Nothing differs from {against} by paired tests.")
+    if BELOW in found:
+        parts.append("Over bound: pooled RMS over the least of any method, by simulation's laws.")
+        if found[BELOW].any():
+            parts.append("Below bound: such errors take what the method should not see.")
     return " ".join(parts)
 
 
 def shown(found: pd.DataFrame) -> pd.DataFrame:
     """A summary with a cell a mean, and without columns that say nothing."""
-    silent = [name for name in COUNTS if not found[name].any()]
+    silent = [name for name in (*COUNTS, BELOW) if name in found and not found[name].any()]
     silent += [PATH] if (found[PATH] == "online").all() else []
     return fold_intervals(found.drop(columns=silent)).rename(columns=COUNT_WORDS)
 

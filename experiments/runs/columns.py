@@ -67,6 +67,10 @@ _OF_THE_PATH = {
     "ate_mean_m": Column("mean position error", "mean error", "m"),
     "ate_aligned_rmse_m": Column("position RMSE after alignment", "RMSE aligned", "m"),
     "heading_rmse_rad": Column("heading RMSE", "heading", "rad"),
+    "bound_rmse_m": Column("least position RMSE of any method", "bound", "m", better=None),
+    "bound_heading_rad": Column(
+        "least heading RMSE of any method", "heading bound", "rad", better=None
+    ),
     "heading_aligned_rmse_rad": Column("heading RMSE after alignment", "heading aligned", "rad"),
     "final_position_error_m": Column("final position error", "final error", "m"),
     "final_heading_error_rad": Column("final heading error", "final heading", "rad"),
@@ -92,6 +96,18 @@ _OF_THE_PATH = {
     "nees_mean": Column(
         "mean NEES (3 when consistent)", "NEES", better=None, average=Average.PLAIN
     ),
+    **{
+        f"inside_{percent}_share": Column(
+            f"share of poses inside the {percent} % ellipsoid",
+            f"inside {percent} %",
+            "",
+            "linear",
+            None,
+            Average.PLAIN,
+        )
+        for percent in (50, 90, 95)
+    },
+    "sharpness_m": Column("position RMSE by the own covariance", "own RMSE", "m", better=None),
     "rpe_1m_rmse_m": Column("position RMSE over 1 m", "RPE 1 m", "m"),
     "rpe_1m_heading_rmse_rad": Column("heading RMSE over 1 m", "RPE heading 1 m", "rad"),
     "rpe_10m_rmse_m": Column("position RMSE over 10 m", "RPE 10 m", "m"),
@@ -116,6 +132,7 @@ def _of(prefix: str, label: str, symbol: str) -> dict[str, Column]:
 
 REVISED, ANSWER = "revised_", "answer_"
 RELATIVE = "ate_rmse_over_"  # and an estimator: of position errors, on the same recordings
+_BOUNDS = {"ate_rmse_m": "bound_rmse_m", "heading_rmse_rad": "bound_heading_rad"}
 PATH = "answer"  # which path the answer is: online or revised
 # The answer of a method is its revised path if it has one, else the online one. Its columns are not
 # in the files: tables and plots derive them (`sweeps.collect`).
@@ -131,6 +148,12 @@ REPEAT = "repeat"  # counts the runs of an estimator over one recording
 ORIGIN = ("run_key", "code_version", "recording_checksum")
 DEPENDENCIES = "dependencies"  # digest of what a row depends on; see `experiments.runs.store`
 _SETTINGS = ("seed", "world_seed", "repeats", "isolated", "recording", "calibration", "name")
+
+
+def bound_of(name: str) -> str:
+    """Column of the least that an error can be; empty for one without."""
+    own = name.removeprefix(REVISED).removeprefix(ANSWER)
+    return name.removesuffix(own) + _BOUNDS[own] if own in _BOUNDS else ""
 
 
 def is_setting(name: str) -> bool:

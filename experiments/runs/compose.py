@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import os
 import re
+import sys
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -428,6 +429,11 @@ def check_overrides(overrides: Sequence[str]) -> None:
         require(
             re.match(r"hydra\b", key) is None or key.startswith(_READ_OF_HYDRA),
             f"{text}: {key} has no effect here; {remedy}",
+        )
+        digits = sys.get_int_max_str_digits()
+        require(
+            re.search(rf"\d{{{digits + 1}}}", text) is None,
+            f"{text[:40]}...: a number of more than {digits} digits; shorten it",
         )
     for override in OverridesParser.create().parse_overrides(list(overrides)):
         key, value = override.key_or_group, override.value()

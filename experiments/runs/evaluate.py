@@ -29,11 +29,13 @@ from experiments.evaluation.metrics import (
     longest_pause_s,
     score,
 )
+from experiments.evaluation.recording_bound import bound_recording, bound_scores
 from experiments.runs.columns import OF_THE_RUN, REVISED, Average, average_of
 from experiments.runs.experiment import Experiment
 from experiments.runs.objects import Objects
 from experiments.runs.processes import is_interrupt
 from experiments.runs.row import GAP, Outcome, Row, Status
+from experiments.runs.schema import is_ours
 from experiments.runs.seeds import stream
 from sim.arrays import Array
 from sim.errors import InputError, require, required
@@ -115,6 +117,8 @@ def evaluate(
             status, scores = statuses[0], every[0]
             if experiment.team is not None:
                 status, scores = status_of_team(statuses), scores_of_team(read, every)
+            else:
+                scores = scores | _bounds(experiment, *paired[0])
         except InputError:
             raise
         except BaseException as error:
@@ -127,6 +131,24 @@ def evaluate(
                 on_estimate(recording, repeat, online, revised)
         rows.append({**labels, "repeat": repeat, **status.columns(), **scores})
     return rows
+
+
+def _bounds(
+    experiment: Experiment, recording: Recording, _: Estimate, revised: Estimate | None
+) -> Row:
+    """Columns of what no method can beat."""
+    settings, read = experiment.config["estimator"], list(recording.sensors)
+    if is_ours(settings) and "programs" not in settings["_target_"]:  # others may read all
+        read = [name for name in read if name in settings.values()]
+    with limit_blas():
+        bound = bound_recording(recording, experiment.prior(recording), read)
+    if bound is None:
+        return {}
+    begin_s = recording.frame_stamps[0] + experiment.config["scoring"]["after_s"]
+    counted = recording.frame_stamps >= begin_s
+    row: Row = {**bound_scores(bound.online[counted])}
+    last = bound_scores(bound.revised[counted]) if revised is not None else {}
+    return row | {f"{REVISED}{name}": value for name, value in last.items()}
 
 
 def runner(

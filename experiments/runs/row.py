@@ -198,6 +198,8 @@ def read_parquet(path: Path, columns: list[str] | None = None, *, remedy: str = 
         for field in table.schema:
             if pa.types.is_nested(field.type):
                 raise ValueError(f"{field.name} holds {field.type}, not plain values")
+            if table.column_names.count(field.name) > 1:
+                raise ValueError(f"{field.name} is there twice")
         return table
 
 

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import pandas as pd
 
-from experiments.evaluation.statistics import holm
-from experiments.runs.columns import COLUMNS, PATH, RELATIVE
+from experiments.evaluation.statistics import BELOW_BOUND, holm, over_bound
+from experiments.runs.columns import COLUMNS, PATH, RELATIVE, bound_of
 from experiments.runs.console import warn
 from experiments.runs.row import GAP, Outcome
 from experiments.sweeps.averages import (
@@ -37,10 +37,16 @@ _LEVEL = 0.05  # of all tests of a table
 _GROUP = "group"  # numbers the rows of a table
 SUFFIXES = ("_low", "_high")  # of the bounds of an interval
 MARKS = ("best", "differs")
+BELOW = "below_bound"  # in what a group's errors are below any honest method's; empty for none
+_BOUNDED = {"position": ERROR, "heading": "answer_heading_rmse_rad"}
 
 
 def summary(
-    table: pd.DataFrame, against: str | None = None, metrics: Sequence[str] = ()
+    table: pd.DataFrame,
+    against: str | None = None,
+    metrics: Sequence[str] = (),
+    *,
+    efficiency: bool = False,
 ) -> pd.DataFrame:
     """Average runs for each combination of the swept settings except the seeds.
 
@@ -58,13 +64,17 @@ def summary(
         paired tests over the recordings, 5 % for the whole table (Holm 1979).
     metrics
         Which to give; by default the main ones that there are.
+    efficiency
+        Add `position_over_bound` and `heading_over_bound`, the pooled error over the least of any
+        method, and `below_bound`, which names the errors that are too small to be honest.
 
     Raises
     ------
     InputError
-        If a metric is not in the table, or the estimator is not.
+        If a metric is not in the table, or the estimator is not, or no row has a bound.
     """
-    table = with_answers(table, metrics or _MAIN)
+    bounded = [name for error in _BOUNDED.values() for name in (error, bound_of(error))]
+    table = with_answers(table, [*(metrics or _MAIN), *(bounded if efficiency else [])])
     by = distinguishing_settings(table.drop(columns=list(DRAWN), errors="ignore"))
     shown = list(metrics) or [c for c in _MAIN if c in table and table[c].notna().any()]
     for column in shown:
@@ -86,8 +96,10 @@ def summary(
         found[f"{name}_best"] = _best(found[name].where(whole), name, on)
     if against is not None:
         _compare(found, sound, shown, against, _rows_of(against, table))
-    bounded = [found.loc[found[name].notna(), f"{name}_low"].notna() for name in shown]
-    found.attrs["rule"] = rule(unit, shown, [each for some in bounded for each in some])
+    if efficiency:
+        _add_efficiency(found, sound)
+    closed = [found.loc[found[name].notna(), f"{name}_low"].notna() for name in shown]
+    found.attrs["rule"] = rule(unit, shown, [each for some in closed for each in some])
     return found.set_axis(groups.size().index).reset_index(drop=not by)
 
 
@@ -109,6 +121,26 @@ def _add(found: pd.DataFrame, name: str, means: pd.DataFrame) -> None:
     """Add the columns of means with their intervals, by groups."""
     for suffix, column in zip(("", *SUFFIXES), means, strict=True):
         found[name + suffix] = means[column]
+
+
+def _add_efficiency(found: pd.DataFrame, table: pd.DataFrame) -> None:
+    """Add the errors over their bounds, pooled over recordings, and which lie below."""
+    require(
+        any(table[b].notna().any() for b in map(bound_of, _BOUNDED.values()) if b in table),
+        "no row has a bound: it takes simulated recordings of a known start, and a map for lasers",
+    )
+    found[BELOW] = ""
+    for kind, error in _BOUNDED.items():
+        bound = bound_of(error)
+        known = table.dropna(subset=[error, bound])
+        squares = known[[error, bound]].astype(float) ** 2
+        means = squares.groupby([known[_GROUP], known[RECORDING]]).mean()
+        for group, own in means.groupby(level=0):
+            ratio, p = over_bound(own[error], own[bound])
+            names = [f"{kind}_over_bound{suffix}" for suffix in ("", *SUFFIXES)]
+            found.loc[group, names] = [ratio.value, ratio.low, ratio.high]
+            if p < BELOW_BOUND:
+                found.loc[group, BELOW] = ", ".join(filter(None, [found.loc[group, BELOW], kind]))
 
 
 def _best(values: pd.Series[float], name: str, on: pd.Series[str]) -> pd.Series[bool]:

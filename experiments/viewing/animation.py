@@ -72,7 +72,7 @@ def pictures(run: Playback) -> Iterator[Picture]:
             alpha=layer.alpha,
             animated=True,
         )[0]
-        for name, layer in _layers(run).items()
+        for name, layer in layers(run).items()
     }
     title = ax.text(0.0, 1.01, "", transform=ax.transAxes, animated=True)
     plan_axes(ax, xlim=(x1, x2), ylim=(y1, y2))
@@ -84,7 +84,7 @@ def pictures(run: Playback) -> Iterator[Picture]:
     canvas.draw()
     page.set_layout_engine("none")
     background = canvas.copy_from_bbox(page.bbox)
-    for points, words in _instants(run, around):
+    for points, words in instants(run, around):
         canvas.restore_region(background)
         for name, line in moving.items():
             line.set_data(*points.get(name, _NONE).T)
@@ -95,22 +95,22 @@ def pictures(run: Playback) -> Iterator[Picture]:
         yield image[: image.shape[0] // 2 * 2, : image.shape[1] // 2 * 2].copy()
 
 
-def _layers(run: Playback) -> dict[str, Layer]:
+def layers(run: Playback) -> dict[str, Layer]:
     """What moves, from the lowest layer up; of several robots each has its colour."""
     if len(run.robots) == 1:
         return _layers_alone(run.robots[0], literal(run.name))
-    layers: dict[str, Layer] = {}
+    found: dict[str, Layer] = {}
     for n, own in enumerate(run.robots):
         colour, label = colour_of(n), f"{literal(run.name)} and 95 % ellipse" if n == 0 else ""
-        layers |= {
+        found |= {
             f"{n} seen": Layer("-", colour, "", width=0.7, alpha=0.6),
             f"{n} truth": Layer("-", colour, f"robot {n}", width=1.6),
             f"{n} robot": Layer("-", colour, ""),
         }
         if own.estimate is not None:
-            layers[f"{n} estimate"] = Layer("--", BLACK, label, width=1.0)
-            layers[f"{n} ellipse"] = Layer("-", BLACK, "", width=0.8)
-    return layers
+            found[f"{n} estimate"] = Layer("--", BLACK, label, width=1.0)
+            found[f"{n} ellipse"] = Layer("-", BLACK, "", width=0.8)
+    return found
 
 
 def _layers_alone(own: RobotTrack, name: str) -> dict[str, Layer]:
@@ -139,7 +139,7 @@ def _layers_alone(own: RobotTrack, name: str) -> dict[str, Layer]:
     return {f"0 {name}": layer for name, layer in layers.items() if layer}
 
 
-def _instants(run: Playback, around: Bounds) -> Iterator[tuple[Points, str]]:
+def instants(run: Playback, around: Bounds) -> Iterator[tuple[Points, str]]:
     """Of each picture: the points of the layers, and the title."""
     recordings = [own.recording for own in run.robots]
     sighted = [sightings(recordings, number) for number in range(len(recordings))]

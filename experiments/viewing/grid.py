@@ -24,13 +24,18 @@ def draw_grid(ax: Axes, grid: OccupancyGrid, **style: Any) -> None:
     in_map = Affine2D().scale(grid.resolution_m).rotate(yaw).translate(x, y) + ax.transData
     options: dict[str, Any] = {"zorder": 0, **style}
     ax.imshow(
-        _picture(grid), origin="lower", extent=(0, columns, 0, rows), transform=in_map, **options
+        grid_picture(grid),
+        origin="lower",
+        extent=(0, columns, 0, rows),
+        transform=in_map,
+        **options,
     )
     ax.update_datalim(grid.corners_m)
     ax.set(xlabel="x, m", ylabel="y, m", aspect="equal")
 
 
-def _picture(grid: OccupancyGrid) -> NDArray[np.uint8]:
+def grid_picture(grid: OccupancyGrid) -> NDArray[np.uint8]:
+    """The grid as a picture (H, W, 3) whose first row is its lowest."""
     greys = np.full(grid.probability.shape, _UNKNOWN, np.uint8)
     greys[grid.free], greys[grid.occupied] = _FREE, _OCCUPIED
     return np.repeat(greys[..., None], 3, axis=2)

@@ -1,8 +1,5 @@
-"""Files of an animation: MP4, GIF, or an HTML page that plays."""
+"""Files of an animation: MP4, GIF, or an HTML page."""
 
-import base64
-import html
-import io
 import shutil
 import subprocess
 from collections.abc import Callable, Iterator
@@ -11,15 +8,15 @@ from typing import Any
 
 from experiments.viewing.animation import Picture, pictures
 from experiments.viewing.playback import Playback
+from experiments.viewing.player import write_page
 from sim.errors import require
 from sim.files import write_whole
-
-_PLAYER = Path(__file__).parent / "player.html"
 
 
 def check_output(path: Path) -> None:
     """Refuse a file that could not be written, before anything is computed."""
-    require(path.suffix in _WRITERS, f"{path}: animations are {', '.join(_WRITERS)}")
+    kinds = (*_WRITERS, ".html")
+    require(path.suffix in kinds, f"{path}: animations are {', '.join(kinds)}")
     require(
         path.suffix != ".mp4" or shutil.which("ffmpeg") is not None,
         f"{path}: MP4 needs ffmpeg, which is not installed; take .gif or .html",
@@ -40,16 +37,20 @@ def save(
     """
     check_output(path)
 
-    def counted() -> Iterator[Picture]:
-        for done, picture in enumerate(pictures(run), start=1):
-            yield picture
-            on_progress(done / len(run.stamps))
-
     with write_whole(path) as part:
-        _WRITERS[path.suffix](run, counted(), part, title)
+        if path.suffix == ".html":
+            write_page(run, part, on_progress, title)
+        else:
+            _WRITERS[path.suffix](run, _counted(run, on_progress), part)
 
 
-def _write_mp4(run: Playback, images: Iterator[Picture], path: Path, _: str) -> None:
+def _counted(run: Playback, on_progress: Callable[[float], None]) -> Iterator[Picture]:
+    for done, picture in enumerate(pictures(run), start=1):
+        yield picture
+        on_progress(done / len(run.stamps))
+
+
+def _write_mp4(run: Playback, images: Iterator[Picture], path: Path) -> None:
     first = next(images)
     size = f"{first.shape[1]}x{first.shape[0]}"
     raw = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", size, "-r", f"{run.fps:.4f}", "-i", "-"]
@@ -78,33 +79,10 @@ def _reduced(image: Picture) -> Any:
     return Image.fromarray(image).quantize(96, method=Image.Quantize.FASTOCTREE)
 
 
-def _write_gif(run: Playback, images: Iterator[Picture], path: Path, _: str) -> None:
+def _write_gif(run: Playback, images: Iterator[Picture], path: Path) -> None:
     first, *rest = (_reduced(image) for image in images)
     duration_ms = round(1000.0 / run.fps)
     first.save(path, "GIF", save_all=True, append_images=rest, duration=duration_ms, loop=0)
 
 
-def _write_html(run: Playback, images: Iterator[Picture], path: Path, title: str) -> None:
-    frames: list[str] = []
-    for image in images:
-        data = io.BytesIO()
-        _reduced(image).save(data, format="PNG")
-        frames.append("data:image/png;base64," + base64.b64encode(data.getvalue()).decode())
-    values = {
-        "width": image.shape[1],
-        "height": image.shape[0],
-        "last": len(frames) - 1,
-        "speed": run.speed,
-        "fps": f"{run.fps:.4f}",
-        "times": ", ".join(f'"{run.clock(float(stamp))} s"' for stamp in run.stamps),
-        "first": frames[0],
-        "frames": ",\n".join(f'"{frame}"' for frame in frames),
-        "title": html.escape(title),
-    }
-    page = _PLAYER.read_text(encoding="utf-8")
-    for name, value in values.items():
-        page = page.replace(f"@{name}@", str(value))
-    path.write_text(page, encoding="utf-8")
-
-
-_WRITERS = {".mp4": _write_mp4, ".gif": _write_gif, ".html": _write_html}
+_WRITERS = {".mp4": _write_mp4, ".gif": _write_gif}

@@ -129,7 +129,8 @@ def _figure_alone(recording: Recording, estimate: Estimate, name: str) -> Figure
 def _points(recording: Recording, estimate: Estimate, name: str) -> Array:
     """Points (N, 2) in map of some readings of a sensor, placed by the estimate."""
     stamps, points = recording.logs[name].stamps, [np.zeros((0, 2))]
-    for row in np.unique(np.linspace(0, len(stamps) - 1, _N_READINGS).astype(int)):
+    n_shown = min(_N_READINGS, len(stamps))
+    for row in np.unique(np.linspace(0, len(stamps) - 1, n_shown).astype(int)):
         at = min(int(np.searchsorted(estimate.stamps, stamps[row])), len(estimate.means) - 1)
         points.append(se2.transform(estimate.means[at], points_in_base(recording, name, row)))
     return np.concatenate(points)[:: max(1, sum(map(len, points)) // _MOST_POINTS)]

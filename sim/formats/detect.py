@@ -177,7 +177,7 @@ def read_all(paths: Sequence[Path], robot: int | None = None) -> Team:
     if _is_recording(first):  # which is checked as it is loaded
         require(len(paths) == 1, f"{first}: a recording is one file, got {len(paths)}")
         team = load(first)
-        if robot is None or len(team) == 1:
+        if robot is None:
             return team
         known = range(len(team))
         require(robot in known, f"{first}: its robots are 0 to {known[-1]}, got {robot}")
@@ -186,7 +186,12 @@ def read_all(paths: Sequence[Path], robot: int | None = None) -> Team:
     least, most = log.n_files
     wanted = f"{least} to {most} files" if most > 1 else "one file"
     require(least <= len(paths) <= most, f"{first}: a {log.name} log is {wanted}, got {len(paths)}")
-    of_robot = {"robot": robot} if log.read is read_mrclam and robot is not None else {}
+    require(len(set(paths)) == len(paths), f"{first}: named twice; its files differ")
+    require(
+        robot is None or log.read is read_mrclam,
+        f"{first}: {log.name} logs are of one robot; leave out --robot",
+    )
+    of_robot = {"robot": robot} if robot is not None else {}
     recording = log.read(*paths, **of_robot)
     with naming(first):
         check_recording(recording)

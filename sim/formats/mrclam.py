@@ -23,7 +23,7 @@ from pathlib import Path
 import numpy as np
 
 from sim.arrays import Array, Ints, Values
-from sim.errors import require
+from sim.errors import InputError, require
 from sim.formats import assemble
 from sim.formats.text import read_members, split_words
 from sim.recording import Log, Recording, Truth
@@ -89,6 +89,10 @@ def read_mrclam(
             ("Barcodes", 2),
         )
     )
+    for name, names in (("Barcodes", barcodes[:, 1]), ("Landmark_Groundtruth", landmarks[:, 0])):
+        each, counts = np.unique(names, return_counts=True)
+        for twice in each[counts > 1][:1]:
+            raise InputError(f"{path}: {name} names {twice:g} twice; keep one line of it")
     notes: assemble.Notes = {}
     odometry = odometry[assemble.in_order(odometry[:, 0], "odometry", notes)]
     truth = truth[assemble.in_order(truth[:, 0], "truth", notes)]

@@ -37,6 +37,7 @@ from sim.formats.rosbag import (
     topics_of,
     typestore,
 )
+from sim.formats.rosbag_bounds import state_checksum
 from sim.recording import Log, Recording, Truth, describe
 from sim.robot.slip import twist_covariances
 from sim.sensors import Mount, point_cloud
@@ -84,6 +85,7 @@ def write_bag(
                 _write_track(bag, name, track)
         if path.suffix == ".mcap":
             target = target / f"{target.name}.mcap"
+            state_checksum(target)
         if path.is_dir():
             shutil.rmtree(path)
         target.replace(path)

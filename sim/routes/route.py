@@ -178,6 +178,9 @@ class Tour(PursuitOptions):
             f"route: world {world.name} has no tour of at least two way-points; give "
             "route.waypoints=[[x, y], ...]",
         )
+        require(
+            _along_m(given)[-1] > 1e-6, "route: its way-points are all one place; give two apart"
+        )
         return given
 
 

@@ -64,6 +64,12 @@ def test_settings_of_hydra_that_nothing_reads_are_refused(override):
         check_overrides([override])
 
 
+def test_a_number_of_too_many_digits_is_refused():
+    check_overrides(["seed=" + "9" * 4300])
+    with pytest.raises(InputError, match=r"^seed=9+\.\.\.: a number of more than 4300 digits"):
+        check_overrides(["seed=" + "9" * 4301])
+
+
 def test_a_cache_that_cannot_be_cleared_is_one_line(tmp_path, monkeypatch):
     monkeypatch.setenv("ESTIMA_RESULTS", str(tmp_path))
     cache.folder().mkdir(parents=True)

@@ -116,7 +116,7 @@ def test_it_documents_the_api(site):
 
 
 def test_its_examples_are_the_scripts(site):
-    pages = [ROOT / "docs" / name for name in ("examples/index.md", "programs.md")]
+    pages = [ROOT / "docs" / name for name in ("examples/index.md", "programs.md", "regression.md")]
     shown = [name for page in pages for name in re.findall(r'--8<-- "(.*?)"', page.read_text())]
     assert sorted(shown) == sorted(
         str(path.relative_to(ROOT))

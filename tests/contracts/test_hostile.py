@@ -9,11 +9,15 @@ import zlib
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from experiments.report.export import as_text, to_markdown
 from experiments.runs import store
 from experiments.runs.console import exit_with, show
+from experiments.runs.dependencies.sources import _known
+from experiments.runs.row import read_parquet
 from experiments.sweeps.launch import _drop, prepare
 from sim.errors import InputError, printable
 from sim.formats.detect import read_any
@@ -79,8 +83,10 @@ def test_cells_cannot_become_markup():
         (BOMB, r"aliases \(\*\) stand for more than 1000000 values"),
         ("a: " + "9" * 5000, r"not valid YAML"),
         ("a: !!bool x", r"not valid YAML"),
+        ('a: 1\nb: ["x\\0y"]', r"x\.yaml:2: holds a zero byte"),
+        ('a: {"x\\ud800": 1}', r"x\.yaml:1: holds a zero byte or half a character"),
     ],
-    ids=["twice", "deep", "endless", "bomb", "long number", "bad tag"],
+    ids=["twice", "deep", "endless", "bomb", "long number", "bad tag", "zero", "half"],
 )
 def test_yaml_out_of_bounds(tmp_path, text, words):
     path = tmp_path / "x.yaml"
@@ -156,3 +162,15 @@ def test_rows_that_cannot_be_read_now_are_kept(tmp_path):
     assert path.exists()
     _drop(path, InputError("it does not match its checksum"))
     assert not path.exists()
+
+
+def test_a_column_that_is_there_twice_is_refused(tmp_path):
+    table = pa.Table.from_arrays([pa.array([1]), pa.array([2])], names=["seed", "seed"])
+    pq.write_table(table, tmp_path / "x.parquet")
+    with pytest.raises(InputError, match=r"x\.parquet: .*seed is there twice"):
+        read_parquet(tmp_path / "x.parquet")
+
+
+def test_a_pipe_in_place_of_the_kept_sources(tmp_path):
+    os.mkfifo(tmp_path / "sources.json")
+    assert _known(tmp_path / "sources.json") == {}

@@ -83,7 +83,7 @@ DEFAULTS = {
     "GtsamIsam2": "96bf5a4b",
     "Gyroscope": "819bc6ea",
     "IcpOdometry": "728fb901",
-    "KissIcp": "105071ed",
+    "KissIcp": "71303030",
     "Laser": "e752606f",
     "Lidar3D": "29cea5d0",
     "Mcl": "ebb5ea64",

@@ -103,10 +103,11 @@ def test_small_gicp_follows_a_circle(reference, use_odometry_guess):
     assert not estimate.covariances.any()
 
 
-def test_kiss_icp_follows_a_circle():
+@pytest.mark.parametrize("guess", ["constant_velocity", "wheels"])
+def test_kiss_icp_follows_a_circle(guess):
     pytest.importorskip("kiss_icp")
     recording = circle(6)
-    estimate = driven(KissIcp(voxel_size_m=0.2), recording)
+    estimate = driven(KissIcp(voxel_size_m=0.2, guess=guess), recording)
     assert off_m(recording, estimate.means).max() < 0.15
 
 

@@ -146,6 +146,7 @@ BAD = {
     "no_mean": ("print('{}', flush=True)", "must answer with mean, 3 numbers; got None"),
     "short": ("print('{\"mean\": [1, 2]}', flush=True)", "mean, 3 numbers"),
     "texts": ("print('{\"mean\": [\"1\", \"2\", \"3\"]}', flush=True)", "mean, 3 numbers"),
+    "true": ("print('{\"mean\": [true, 2, 3]}', flush=True)", "mean, 3 numbers"),
     "null": ("print('{\"mean\": [1, null, 3]}', flush=True)", "mean, 3 numbers"),
     "nan": ("print('{\"mean\": [NaN, 0, 0]}', flush=True)", "not a JSON object"),
     "covariance": (
@@ -431,9 +432,10 @@ def test_the_copy_holds_what_frames_show(recording, tmp_path):
 
 @pytest.mark.skipif(shutil.which("g++") is None, reason="no C++ compiler")
 def test_the_suite_of_a_cpp_program_runs(tmp_path, monkeypatch):
-    suite = read_suite(EXAMPLES / "cpp_gate" / "suite.yaml")
+    suite = read_suite(EXAMPLES / "own_gate" / "suite.yaml")
     overrides = (*suite.overrides["laser"], "route.distance_m=1", "sensors.laser.n_beams=11")
     suite = dataclasses.replace(suite, counts={"laser": 1}, overrides={"laser": overrides})
+    suite = suite.select(["my_odometry"])
     source = EXAMPLES / "external_odometry.cpp"
     subprocess.run(["g++", "-o", tmp_path / "external_odometry", source], check=True)
     monkeypatch.chdir(tmp_path)

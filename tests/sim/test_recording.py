@@ -326,6 +326,29 @@ def test_ragged_fields_of_a_reading_have_as_many_rows():
         log_of_readings(schema, np.zeros(1), [{"points": np.ones((1, 2)), "ids": 3}], "s")
 
 
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"logs": {"laser": 0.05}}, r"laser has a reading at 0\.05 s, and no Frame is then"),
+        ({"wheels": 1}, r"wheels\.stamps leave 0\.5 s of its Frames without a reading"),
+        ({"wheels": 4}, r"wheels\.stamps leave 0\.2 s of its Frames without a reading"),
+    ],
+    ids=["between Frames", "one of the wheels", "wheels end early"],
+)
+def test_readings_that_no_frame_would_show(tmp_path, change, words):
+    recording = small_recording()
+    if "wheels" in change:
+        wheels = WheelLog(*(v[: change["wheels"]] for v in vars(recording.wheels).values()))
+        recording = dataclasses.replace(recording, wheels=wheels)
+    else:
+        log = recording.logs["laser"]
+        moved = dataclasses.replace(log, stamps=log.stamps + change["logs"]["laser"])
+        recording = recording.with_log("laser", moved)
+    save(recording, tmp_path / "a.npz")
+    with pytest.raises(InputError, match=words):
+        load(tmp_path / "a.npz")
+
+
 @pytest.mark.parametrize("damage", ["cut", "flip", "empty", "text", "other_zip"])
 def test_damaged_files_are_refused_by_name(tmp_path, damage):
     path = tmp_path / "a.npz"

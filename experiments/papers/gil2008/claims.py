@@ -151,7 +151,7 @@ def gi2(particles: pd.DataFrame, bound: pd.DataFrame) -> Iterator[Claim]:
         some = table[table["n_particles"] == 500].groupby("seed").first()
         for column, what in list(ERRORS.items())[:2]:
             found = median_interval((some[column] / best[column]).dropna().to_numpy())
-            label = f"{what} error at M = 500 over the batch bound, median of worlds: {where}"
+            label = f"{what} error at M = 500 over the batch baseline, median of worlds: {where}"
             yield shown(replace(about, quantity=f"{what} over bound"), label, found, "ours: 2")
 
 

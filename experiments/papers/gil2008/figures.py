@@ -1,4 +1,4 @@
-"""Figures of gil2008: the paper's, with odometry and the batch bound drawn in, and its claims'."""
+"""Figures of gil2008: the paper's, with odometry and the batch baseline, and its claims'."""
 
 from __future__ import annotations
 
@@ -258,7 +258,7 @@ def by_particles(repeats: pd.DataFrame, bound: pd.DataFrame) -> Figure:
                     found.index * (1.0 + 0.06 * j), found["mean"], 2.0 * found["std"],
                     marker=marker, color=colour, label=words, capsize=2.5, lw=1.0, ms=4,
                 )  # fmt: skip
-            ax.axhline(float(best[column].iloc[0]), color=_BATCH, ls=":", label="batch bound")
+            ax.axhline(float(best[column].iloc[0]), color=_BATCH, ls=":", label="batch baseline")
             scale: dict[str, Any] = {"xscale": "log", "ylabel": label, "ylim": (0.0, None)}
             set_axes(ax, ticks=repeats["n_particles"], title=design, **_LEFT, **scale)
     set_axes(grid[-1], xlabel="particles M")
@@ -290,7 +290,7 @@ def by_particles_over_worlds(particles: pd.DataFrame, bound: pd.DataFrame) -> Fi
         best = np.log(bound[bound["noise"] == noise][list(columns)]).mean()
         for ax, (column, label) in zip(row, columns.items(), strict=True):
             _by_filter(ax, table, "n_particles", column)
-            ax.axhline(np.exp(best[column]), color=_BATCH, ls=":", label="batch bound")
+            ax.axhline(np.exp(best[column]), color=_BATCH, ls=":", label="batch baseline")
             title = f"{label}, {_NOISE[noise]}"
             set_axes(ax, xscale="log", plain="y", ticks=[10, 50, 200, 1000], title=title, **_LEFT)
         row[0].set_ylabel("RMS error, m")

@@ -70,7 +70,8 @@ class _Known(dict[str, Source]):
 def _known(path: Path) -> _Known:
     known = _Known()
     with suppress(OSError, ValueError, TypeError, RecursionError):
-        for key, (digest, imports) in json.loads(path.read_text()).items():
+        text = path.read_text() if path.is_file() else "{}"  # a pipe would wait forever
+        for key, (digest, imports) in json.loads(text).items():
             if isinstance(digest, str) and all(isinstance(name, str) for name in imports):
                 known[key] = Source(digest, tuple(imports))
     known.kept = len(known)

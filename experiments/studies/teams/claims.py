@@ -1,7 +1,7 @@
 """The claim GI9: sightings of one another make a team's localization better.
 
 A world is the unit of inference. The paper's own method, FastSLAM, decides; EKF-SLAM and the batch
-bound stand beside it, and what communication costs.
+baseline stand beside it, and what communication costs.
 """
 
 from collections.abc import Iterator

@@ -56,6 +56,15 @@ def test_tracks():
     assert 20 <= len(used) <= 30  # a scan every 0.2 m of 5 m
 
 
+def test_says_that_it_is_lost():
+    _, frames = drive(ROOM, 60, wheel_noise_m=NOISE_M)
+    given = prior()
+    astray = dataclasses.replace(given, mean=given.mean + np.array([1.0, -1.0, 1.0]))
+    here, there = (follow(Mcl(**WHEELS, recovery="none"), frames, g) for g in (given, astray))
+    assert max(belief.extras["lost"] for belief in here) < 0.2
+    assert min(belief.extras["lost"] for belief in there[1:]) > 0.4
+
+
 def test_knows_its_error():
     """With likelihoods at their worth and no jitter, over recordings, and scans of 60 beams."""
     squares = []

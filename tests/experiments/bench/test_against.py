@@ -80,6 +80,22 @@ def test_a_revision_is_checked_out_once(repository, capsys):
         run_in(repository, "import gone")
 
 
+def test_compiled_code_is_shared_if_all_of_it_is_equal(repository):
+    for name in ("a", "b"):
+        (repository / "sim" / "__pycache__").mkdir(parents=True, exist_ok=True)
+        (repository / "sim" / f"{name}.py").write_text(name)
+        (repository / "sim" / "__pycache__" / f"{name}.f-1.py311.nbi").write_text(name)
+    git("add", "sim/*.py", folder=repository)
+    who = ("-c", "user.name=a", "-c", "user.email=a@b")
+    git(*who, "commit", "-qm", "compiled", folder=repository)
+    (repository / "sim" / "b.py").write_text("c")
+    git(*who, "commit", "-qam", "another", folder=repository)
+    here, before = (checkout(name, repository).folder / "sim" for name in ("HEAD", "HEAD~1"))
+    assert (here / "__pycache__" / "a.f-1.py311.nbi").read_text() == "a"
+    assert (here / "a.py").stat().st_mtime == (repository / "sim" / "a.py").stat().st_mtime
+    assert not (before / "__pycache__").exists()  # of b, which a may hold
+
+
 def test_ratios_stand_beside_the_figures(monkeypatch):
     figures = [{"name": "a.step_ms", "value": 2.0, "unit": "ms"}]
     monkeypatch.setattr(against, "checkout", lambda _: against.Checkout(OLD, "c"))

@@ -253,7 +253,7 @@ def test_frames_in_a_gap_of_the_truth_are_not_scored():
 def test_every_score_says_its_unit():
     recording = fakes.circle(n_frames=400)
     pure = {"nees_mean", "nees_counted_share", "final_in_ellipse"}
-    pure |= {"stamps_scored", "stamps_left_out"}
+    pure |= {"stamps_scored", "stamps_left_out"} | {f"inside_{p}_share" for p in (50, 90, 95)}
     keys = set(metrics.score(recording, fakes.estimate(recording)))
     assert {
         *("ate_rmse_m", "ate_aligned_rmse_m", "heading_rmse_rad", "heading_aligned_rmse_rad"),
@@ -294,3 +294,16 @@ def test_the_ellipse_of_a_singular_covariance_holds_nothing():
     covariance = np.diag([0.01, 0.01, 1e-6])
     assert metrics.in_ellipse(pose, near, covariance)
     assert not metrics.in_ellipse(pose, far, covariance)
+
+
+def test_shares_inside_are_those_of_a_consistent_method():
+    rng = np.random.default_rng(4)
+    roots = rng.normal(size=(4000, 3, 3)) * 0.05
+    covariances = roots @ roots.transpose(0, 2, 1)
+    means = (roots @ rng.normal(size=(4000, 3, 1)))[:, :, 0]
+    row = metrics.path_scores(np.zeros((4000, 3)), means, covariances)
+    for percent in (50, 90, 95):
+        assert row[f"inside_{percent}_share"] == pytest.approx(percent / 100, abs=0.03)
+    assert row["sharpness_m"] == pytest.approx(row["ate_rmse_m"], rel=0.05)
+    timid = metrics.path_scores(np.zeros((4000, 3)), means, 100.0 * covariances)
+    assert timid["inside_50_share"] > 0.95

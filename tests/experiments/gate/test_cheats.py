@@ -7,6 +7,7 @@ import sys
 import numpy as np
 import pytest
 
+import experiments.gate.conform as conform
 from estimators.base import Belief, run
 from estimators.odometry import Odometry
 from experiments.gate.conform import check_estimator, example
@@ -219,3 +220,30 @@ def test_the_numbers_drawn_stay_and_the_seed_is_hidden(case):
     assert entropy.bit_length() > 128
     _, other = detach(prior, given, dataclasses.replace(recording, status="other"))
     assert other.bit_generator.seed_seq.entropy != entropy  # the truth counts too
+
+
+class KnowsTruth(Odometry):
+    """The truth with a little noise, by the start that it is given."""
+
+    sigma, drives = 1e-3, []
+
+    def reset(self, prior, rng):
+        super().reset(prior, rng)
+        starts = [np.abs(of_drive.mean - prior.mean).max() for _, of_drive in self.drives]
+        recording, _ = self.drives[int(np.argmin(starts))]
+        self.truth = iter(recording.truth_at(recording.frame_stamps))
+        self.rng = rng
+
+    def step(self, frame):
+        mean = next(self.truth) + self.sigma * self.rng.standard_normal(3)
+        return Belief(mean, self.sigma**2 * np.eye(3))
+
+
+@pytest.mark.parametrize(("sigma", "called"), [(1e-3, True), (0.1, False)])
+def test_errors_below_the_bound_are_called(monkeypatch, sigma, called):
+    drives = [conform._drive((), seed) for seed in range(5)]
+    monkeypatch.setattr(KnowsTruth, "drives", drives)
+    monkeypatch.setattr(KnowsTruth, "sigma", sigma)
+    found = conform.find_below_bound(lambda: KnowsTruth(kr=1e-5, kl=1e-5), drives)
+    assert ("times the least of any honest method" in found) is called
+    assert not conform.find_below_bound(lambda: Odometry(kr=1e-5, kl=1e-5), drives)

@@ -376,11 +376,21 @@ def test_the_first_screen_has_the_leaderboard_by_world(tmp_path):
     assert leaderboard.by_world(path) == {
         "worlds": ["v", "w"],
         "rows": [  # c did not run in all worlds
-            ("b", [("0.12", True), ("0.40", False)]),
-            ("a", [("0.20", False), ("0.30", True)]),
+            ("b", [("0.12", True), ("0.40", False)], ""),
+            ("a", [("0.20", False), ("0.30", True)], ""),
         ],
         "n_methods": 2,
+        "bounded": False,
     }
+    over = {
+        "position_over_bound": [2.0, 1.1, None, 8.0, 1.0],
+        "below_bound": ["", "", "", "", "heading"],
+    }
+    frame = pd.DataFrame({**rows, "answer_ate_rmse_m": [0.2, 0.1234, 0.01, 0.3, 0.4], **over})
+    write_frame(frame, path)
+    found = leaderboard.by_world(path)
+    assert found["bounded"]
+    assert [over for *_, over in found["rows"]] == ["below the bound", "4.0"]
     write_frame(pd.DataFrame(rows), path)
     assert leaderboard.by_world(path) == {}
 

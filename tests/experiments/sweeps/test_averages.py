@@ -56,6 +56,26 @@ def test_errors_pool_repeats_by_squares_and_recordings_geometrically():
     np.testing.assert_allclose(nees[1:], list(vars(mean_interval(each)).values()))
 
 
+def test_errors_over_the_bound_are_pooled_and_a_cheat_is_called():
+    table = runs(ratio=0.01).assign(heading_rmse_rad=0.1)
+    with pytest.raises(InputError, match="no row has a bound"):
+        summary(table, efficiency=True)
+    of_a = table.query("`choice.estimator` == 'a'")
+    least = table["seed"].map(of_a.groupby("seed")["ate_rmse_m"].max())
+    table = table.assign(bound_rmse_m=least / 1.5, bound_heading_rad=np.nan)
+    found = summary(table, efficiency=True).set_index("choice.estimator")
+    own = table.loc[of_a.index, ["ate_rmse_m", "bound_rmse_m"]] ** 2
+    assert found.loc["a", "position_over_bound"] == pytest.approx(
+        np.sqrt(own["ate_rmse_m"].sum() / own["bound_rmse_m"].sum())
+    )
+    assert found["below_bound"].to_dict() == {"a": "", "b": "position"}
+    assert "should not see" in notes(found.reset_index(), None)
+    lines = sweep_figure(table, "seed", "ate_rmse_m", "choice.estimator").axes[0].get_lines()
+    assert [line.get_ydata()[0] for line in lines if line.get_linestyle() == ":"] == pytest.approx(
+        2 * [least.iloc[0] / 1.5]
+    )
+
+
 def test_settings_are_no_repeats():
     """Errors of 1 and 100 of two estimators over each recording are 10, not 71."""
     table = runs().assign(ate_rmse_m=np.tile([1.0, 1.0, 100.0, 100.0], 12))

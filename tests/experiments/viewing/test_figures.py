@@ -38,7 +38,7 @@ def test_figure_8_over_worlds_has_equal_samples_and_names_every_filter():
         for drawn in ax.containers:
             assert drawn.lines[0].get_ydata() == pytest.approx([1.0, 1.0])
     named = {text.get_text() for text in page.legends[0].get_texts()}
-    assert named == {"as printed", "FastSLAM 2.0", "batch bound"}
+    assert named == {"as printed", "FastSLAM 2.0", "batch baseline"}
 
 
 def test_ways_to_associate_stand_at_one_height_left_and_right():

@@ -73,3 +73,14 @@ def test_a_picture_that_fails_is_a_warning_after_the_results(tmp_path, monkeypat
     ]
     assert not picture.exists()  # that of a run before would be taken for it
     assert "position RMSE" in said.out
+
+
+def test_a_sensor_that_never_fired_is_drawn(tmp_path, estimate):
+    recording = partly_true()
+    name, log = "laser", recording.logs["laser"]
+    none = dataclasses.replace(
+        log, stamps=log.stamps[:0], values={k: v[:0] for k, v in log.values.items()}
+    )
+    save_figure(
+        run_figure([(recording.with_log(name, none), estimate)], "mine"), tmp_path / "run.png"
+    )

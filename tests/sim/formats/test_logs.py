@@ -10,7 +10,9 @@ import pytest
 
 from sim.errors import InputError
 from sim.formats import intel, lego, mrclam, rawseeds, relations, wean
+from sim.formats.detect import read_any
 from sim.formats.text import split_words
+from sim.recording import save
 from tests.fixtures import log_samples as samples
 from tests.fixtures.fakes import true_ids
 from tests.fixtures.log_samples import ARC, DATA, RANGES
@@ -106,6 +108,19 @@ def test_mrclam_refused(tmp_path):
         mrclam.read_mrclam(mrclam_folder(tmp_path), 2)
     with pytest.raises(InputError, match=r"Robot1_Odometry.dat:2: .* 3 numbers, this has 2"):
         mrclam.read_mrclam(mrclam_folder(tmp_path, **{"Robot1_Odometry.dat": b"0 0 0\n1 2\n"}))
+    with pytest.raises(InputError, match=r"Barcodes names 72 twice"):
+        mrclam.read_mrclam(mrclam_folder(tmp_path, **{"Barcodes.dat": b"6 72\n7 72\n"}))
+
+
+def test_files_and_robots_that_a_log_does_not_have(tmp_path):
+    raw = write(tmp_path / "raw.json", samples.intel_json())
+    with pytest.raises(InputError, match=r"raw\.json: named twice"):
+        read_any([raw, raw])
+    with pytest.raises(InputError, match=r"raw\.json: intel logs are of one robot"):
+        read_any([raw], 3)
+    save(read_any([raw]), tmp_path / "one.npz")
+    with pytest.raises(InputError, match=r"its robots are 0 to 0, got 3"):
+        read_any([tmp_path / "one.npz"], 3)
 
 
 def test_rawseeds(tmp_path):

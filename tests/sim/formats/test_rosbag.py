@@ -274,3 +274,14 @@ def test_a_database_that_brings_a_program(tmp_path):
         )
     with pytest.raises(InputError, match="a database with a view of its own is not a bag"):
         read_bag(path)
+
+
+def test_a_flipped_bit_of_an_mcap_is_noticed(tmp_path):
+    path = tmp_path / "run.mcap"
+    write_bag(path, full_recording(), {})
+    whole = path.read_bytes()
+    end = whole.rindex(struct.pack("<BQ", 15, 4))  # of the data; an index follows
+    for at in np.linspace(40, end - 1, 6).astype(int):
+        path.write_bytes(whole[:at] + bytes([whole[at] ^ 1]) + whole[at + 1 :])
+        with pytest.raises(InputError, match="damaged or not a bag"):
+            read_bag(path)

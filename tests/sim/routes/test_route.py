@@ -158,3 +158,10 @@ def test_a_robot_that_rolls_past_its_goal_comes_to_rest():
     assert commands[0] is not None
     assert commands[-1] is None
     assert driver.trouble is None
+
+
+def test_way_points_all_in_one_place_are_no_tour():
+    world = World("open", np.zeros((0, 4)), np.zeros((0, 2)))
+    tour = Tour(waypoints=((1.0, 2.0), (1.0, 2.0)), distance_m=1.0)
+    with pytest.raises(InputError, match="way-points are all one place"):
+        tour.start(world, ROBOT)

@@ -1,0 +1,91 @@
+"""Does a method notice that it is lost? Its alarms against the truth.
+
+It is lost while its position is off by more than `LOST_M`, for `HOLD_S` at least. What it says is
+its extra `lost`, if it gives one, else the standard deviation of its position along the worst
+direction; an alarm stands while that is at or above a threshold. A loss is missed if no alarm
+stands within `DELAY_S` of its beginning. False alarms are counted in windows of `WINDOW_S`, each as
+one, that hold neither a loss nor the `DELAY_S` after one.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from estimators.base import Estimate
+from experiments.evaluation.metrics import position_errors_m
+from sim.arrays import Array
+
+LOST_M, HOLD_S = 1.0, 2.0
+DELAY_S = 10.0
+WINDOW_S = 10.0
+
+
+class Evidence(NamedTuple):
+    """What a method said over a run.
+
+    Attributes
+    ----------
+    peaks
+        (L,) the most in the first `DELAY_S` of each loss.
+    quiet
+        (W,) the most in each window without one.
+    """
+
+    peaks: Array
+    quiet: Array
+
+
+def alarm_signal(estimate: Estimate) -> Array:
+    """How lost a method says it is (T,): in its own unit, or m; infinite without a pose."""
+    block, own = estimate.covariances[:, :2, :2], estimate.extras.get("lost", [])
+    known = np.isfinite(estimate.means).all(axis=1) & np.isfinite(block).all(axis=(1, 2))
+    signal = np.full(len(block), np.inf)
+    if any(value is not None for value in own):
+        signal[known] = np.array([value or 0.0 for value in own], np.float64)[known]
+    else:
+        signal[known] = np.sqrt(np.maximum(np.linalg.eigvalsh(block[known])[:, -1], 0.0))
+    return signal
+
+
+def find_losses(stamps: Array, errors_m: Array) -> Array:
+    """First and last stamp (L, 2), s, of each time of being lost; NaN errors are none."""
+    beyond = np.concatenate([[False], errors_m > LOST_M, [False]])
+    begin, end = np.flatnonzero(np.diff(beyond.astype(np.int8))).reshape(-1, 2).T
+    spans = np.column_stack([stamps[begin], stamps[end - 1]])
+    return np.asarray(spans[spans[:, 1] - spans[:, 0] >= HOLD_S])
+
+
+def evidence_of(truth: Array, estimate: Estimate) -> Evidence:
+    """Evidence of an estimate against the true poses (T, 3) at its stamps."""
+    stamps, signal = estimate.stamps, alarm_signal(estimate)
+    losses = find_losses(stamps, position_errors_m(truth, estimate.means))
+    peaks = [
+        signal[(stamps >= begin) & (stamps <= min(end, begin + DELAY_S))].max()
+        for begin, end in losses
+    ]
+    starts = np.arange(stamps[0], stamps[-1] - WINDOW_S + 1e-9, WINDOW_S)
+    clear = [
+        start
+        for start in starts
+        if not ((start < losses[:, 1] + DELAY_S) & (start + WINDOW_S > losses[:, 0])).any()
+    ]
+    quiet = [signal[(stamps >= s) & (stamps < s + WINDOW_S)].max(initial=0.0) for s in clear]
+    return Evidence(np.array(peaks, np.float64), np.array(quiet, np.float64))
+
+
+def alarm_curve(runs: Sequence[Evidence]) -> Array:
+    """Threshold, share of losses missed, and false alarms an hour (K, 3) of a method's runs.
+
+    The thresholds are those at which another loss is missed, and an infinite one, without alarms.
+    """
+    peaks, quiet = (np.concatenate(parts) for parts in zip(*runs, strict=True))
+    hours = np.float64(len(quiet) * WINDOW_S / 3600.0)
+    thresholds = np.append(np.unique(peaks[np.isfinite(peaks)]), np.inf)
+    missed = np.array([(peaks < threshold).sum() for threshold in thresholds])
+    alarms = np.array([(quiet >= threshold).sum() for threshold in thresholds])
+    # without losses or quiet hours there is no share and no rate
+    with np.errstate(invalid="ignore"):
+        return np.column_stack(
+            [thresholds, missed / np.float64(len(peaks)), alarms / np.float64(hours)]
+        )

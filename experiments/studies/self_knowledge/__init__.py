@@ -1,0 +1,1 @@
+"""Whether methods notice that they are lost (ours)."""

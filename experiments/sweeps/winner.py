@@ -1,0 +1,154 @@
+"""Who won a sweep, by how much, and by which test: the answer that its page opens with."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+import pandas as pd
+from scipy import stats
+
+from experiments.evaluation.statistics import holm
+from experiments.runs.columns import title
+from experiments.runs.console import pluralize
+from experiments.runs.row import GAP, Outcome
+from experiments.sweeps.averages import RECORDING, difference_p, pool_repeats
+from experiments.sweeps.collect import DRAWN, distinguishing_settings, with_answers
+from experiments.sweeps.summary import ERROR
+
+_LEVEL = 0.05  # of all tests together
+MIN_RECORDINGS = 3  # of a test
+_ARM, _BETWEEN, _ESTIMATOR = "arm", ", ", "choice.estimator"
+
+
+@dataclass(frozen=True)
+class Rival:
+    """An arm beside the winner, over their common recordings.
+
+    Attributes
+    ----------
+    ratio, low, high
+        Its error over the winner's, a geometric mean, with its 95 % interval.
+    differs
+        Whether it is worse by the paired test, Holm's over all pairs of arms.
+    """
+
+    name: str
+    ratio: float
+    low: float
+    high: float
+    differs: bool
+
+    def __str__(self) -> str:
+        interval = f" [{self.low:.3g}, {self.high:.3g}]" if math.isfinite(self.low) else ""
+        return f"{self.name} ({self.ratio:.3g}{interval} times its error)"
+
+
+@dataclass(frozen=True)
+class Winner:
+    """The arm with the least error.
+
+    Attributes
+    ----------
+    name, error_m
+        The arm, and the geometric mean of its error over the recordings.
+    rivals
+        The others, the best first.
+    out
+        Arms of which runs failed or have gaps; they cannot win.
+    """
+
+    name: str
+    error_m: float
+    n_recordings: int
+    rivals: tuple[Rival, ...]
+    out: tuple[str, ...]
+
+    def sentences(self) -> list[str]:
+        """The answer: the winner, the margin, what is level, and the test."""
+        said = [f"{self.name} has the smallest error: {self.error_m:.3g} m."]
+        level = [str(rival) for rival in self.rivals if not rival.differs]
+        behind = [str(rival) for rival in self.rivals if rival.differs]
+        if level:
+            said.append(f"Not significantly worse: {_BETWEEN.join(level)}.")
+        if behind:
+            more = f", and {len(behind) - 1} more" if len(behind) > 1 else ""
+            said.append(f"Significantly worse: {behind[0]}{more}.")
+        if self.out:
+            said.append(f"Left out, since runs failed or have gaps: {_BETWEEN.join(self.out)}.")
+        return [*said, self._test()]
+
+    def _test(self) -> str:
+        n = pluralize(self.n_recordings, "recording")
+        if not self.rivals:
+            return f"Over {n}; nothing to compare it with."
+        if self.n_recordings < MIN_RECORDINGS:
+            return f"Over {n}, too few for a test: more seeds would tell."
+        all_pairs = " of all pairs" if len(self.rivals) > 1 else ""
+        holm_s = " in all (Holm)" if all_pairs else ""
+        return f"Paired t tests of the logs{all_pairs} over {n}, at 5 %{holm_s}."
+
+
+def find_winner(table: pd.DataFrame) -> Winner | None:
+    """Compare the estimators of a sweep; of one estimator, its settings.
+
+    Arms are compared over the recordings that all of them have, by the position error of their
+    best answers, averaged over their other settings. None where there is no such recording, or
+    nothing was swept.
+    """
+    table = with_answers(table, [ERROR])
+    swept = [name for name in distinguishing_settings(table) if name not in DRAWN]
+    arms = [_ESTIMATOR] if _ESTIMATOR in swept else swept
+    if not arms or ERROR not in table:
+        return None
+    table = table.assign(**{_ARM: _names(table, arms)})
+    whole, out = _whole(table)
+    others = [name for name in swept if name not in arms]
+    errors = pool_repeats(whole, [_ARM, RECORDING], ERROR, others).unstack(0).dropna()
+    if errors.empty or not (errors > 0.0).all(axis=None):
+        return None
+    means = np.exp(np.log(errors).mean()).sort_values()
+    best = str(means.index[0])
+    differ = _differing(errors) if len(errors) >= MIN_RECORDINGS else set()
+    rivals = [
+        _rival(str(name), np.log(errors[name] / errors[best]), {best, str(name)} in differ)
+        for name in means.index[1:]
+    ]
+    return Winner(best, float(means.iloc[0]), len(errors), tuple(rivals), tuple(out))
+
+
+def _differing(errors: pd.DataFrame) -> set[frozenset[str]]:
+    """Pairs of arms that differ; all are tested, since the best is chosen by the same data."""
+    pairs = list(combinations(errors, 2))
+    p = [difference_p(errors[first], errors[second], ERROR) for first, second in pairs]
+    rejected = holm([1.0 if math.isnan(each) else each for each in p], _LEVEL)
+    return {frozenset(pair) for pair, is_one in zip(pairs, rejected, strict=True) if is_one}
+
+
+def _rival(name: str, logs: pd.Series[float], differs: bool) -> Rival:
+    n, mean = len(logs), float(logs.mean())
+    half = math.nan
+    if n >= MIN_RECORDINGS:
+        half = float(stats.t.ppf(0.975, n - 1) * logs.std() / math.sqrt(n))
+    return Rival(name, math.exp(mean), math.exp(mean - half), math.exp(mean + half), differs)
+
+
+def _names(table: pd.DataFrame, arms: list[str]) -> pd.Series[str]:
+    """What each run's arm is called."""
+    if arms == [_ESTIMATOR]:
+        return table[_ESTIMATOR].astype(str)
+    texts = [title(name) + " " + table[name].astype(str) for name in arms]
+    named = texts[0]
+    for text in texts[1:]:
+        named = named + _BETWEEN + text
+    return named
+
+
+def _whole(table: pd.DataFrame) -> tuple[pd.DataFrame, list[str]]:
+    """Rows of the arms that answered everywhere, and the names of the others."""
+    code = table.get("status_code", table["status"])
+    short = (table["status"] == Outcome.FAILED) | (code == GAP) | table[ERROR].isna()
+    out = sorted(table.loc[short, _ARM].unique())
+    return table[~table[_ARM].isin(out)], out

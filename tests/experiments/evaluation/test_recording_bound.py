@@ -1,0 +1,146 @@
+"""Which rows get a bound, what it is not for, and that a cheat lies below it."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import experiments.evaluation.recording_bound as bounds
+from estimators.base import Belief
+from experiments.evaluation.statistics import over_bound
+from experiments.runs.evaluate import evaluate
+from experiments.runs.experiment import Experiment
+from sim.recording import Recording
+
+DRIVE = (
+    "robot=robocom",
+    "world=rooms",
+    "simulation.physics=kinematic",
+    "simulation.rays=exact",
+)
+SHORT = (*DRIVE, "route.distance_m=4")
+STEREO, LASER = (*SHORT, "sensors=stereo_pixel"), (*SHORT, "sensors=hokuyo")
+COLUMNS = {"bound_rmse_m", "bound_heading_rad"}
+
+
+class Cheat:
+    """The truth with a little noise."""
+
+    def __init__(self, recording: Recording, sigma: float) -> None:
+        self.truth, self.sigma = recording.truth_at(recording.frame_stamps), sigma
+
+    def reset(self, prior, rng):
+        self.rng, self.row = rng, -1
+
+    def step(self, frame):
+        self.row += 1
+        mean = self.truth[self.row] + self.sigma * self.rng.standard_normal(3)
+        return Belief(mean, self.sigma**2 * np.eye(3))
+
+
+def bound_columns(*words):
+    (row,) = evaluate(Experiment.compose([*words]))
+    return {name: value for name, value in row.items() if "bound" in name}
+
+
+def test_online_and_revised_estimates_have_bounds_of_their_own():
+    found = bound_columns(*STEREO, "estimator=smoother")
+    assert set(found) == COLUMNS | {f"revised_{name}" for name in COLUMNS}
+    for name in COLUMNS:
+        assert 0.0 < found[f"revised_{name}"] < found[name]
+
+
+def test_landmarks_that_are_known_tell_more():
+    unknown, known = (
+        bound_columns(*STEREO, "estimator=ekf_slam", f"prior.map={m}") for m in ("none", "world")
+    )
+    assert set(unknown) == set(known) == COLUMNS
+    assert known["bound_rmse_m"] < unknown["bound_rmse_m"]
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        (*LASER, "estimator=ekf_icp"),  # no map
+        (*LASER, "estimator=mcl", "prior.map=world", "prior.start=global"),
+        (*LASER, "estimator=mcl", "prior.map=world", "sensors.laser.sigma_range_m=0"),
+    ],
+)
+def test_no_bound_without_what_it_takes(words):
+    assert not bound_columns(*words)
+
+
+@pytest.mark.slow
+def test_wheels_alone_are_at_their_bound():
+    """On a short way; what else the recording has, odometry does not read."""
+    rows = [
+        row
+        for seed in range(30)
+        for row in evaluate(Experiment.compose([*LASER, "estimator=odometry", f"seed={seed}"]))
+    ]
+    for error, bound in (("ate_rmse_m", "bound_rmse_m"), ("heading_rmse_rad", "bound_heading_rad")):
+        squares = np.array([[row[error] ** 2, row[bound] ** 2] for row in rows])
+        ratio, p = over_bound(*squares.T)
+        assert ratio.low < 1.0 < ratio.high
+        assert p > 0.01
+
+
+def test_no_bound_over_a_real_log_or_another_robot():
+    experiment = Experiment.compose([*STEREO, "estimator=ekf_slam"])
+    recording = experiment.recording()
+    prior = experiment.prior(recording)
+
+    def columns(**changed):
+        other = dataclasses.replace(recording, **changed)
+        return bounds.bound_recording(other, prior, ["stereo"])
+
+    assert columns() is not None
+    truth, robot = recording.known_truth, recording.config["robot"]
+    assert columns(truth=None) is None
+    assert columns(truth=dataclasses.replace(truth, wheel_travel_m=np.zeros((0, 2)))) is None
+    assert columns(config={}) is None
+    assert columns(config={"robot": {**robot, "_target_": "elsewhere.Robot"}}) is None
+
+
+def test_bound_is_made_once_a_recording(monkeypatch):
+    made = []
+    whole = bounds.bound_path
+    monkeypatch.setattr(bounds, "bound_path", lambda chain: made.append(0) or whole(chain))
+    bounds._bound.cache_clear()
+    for estimator in ("ekf_slam", "fastslam"):
+        evaluate(Experiment.compose([*STEREO, f"estimator={estimator}", "repeats=2"]))
+    assert len(made) == 1
+
+
+@pytest.mark.parametrize("given", ["laser", "stereo"])
+def test_a_cheat_lies_below_the_bound_and_a_bad_guess_above(given):
+    words = [*STEREO] if given == "stereo" else [*LASER, "prior.map=world"]
+    plain = Experiment.compose([*words, "estimator=odometry"])
+    for sigma, below in ((1e-6, True), (0.3, False)):
+        cheat = plain.with_estimator_object(Cheat(plain.recording(), sigma))
+        (row,) = evaluate(cheat)
+        assert (row["ate_rmse_m"] < row["bound_rmse_m"]) is below
+        assert (row["heading_rmse_rad"] < row["bound_heading_rad"]) is below
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("estimator", ["ekf_slam", "smoother", "mcl"])
+def test_no_method_is_significantly_below_the_bound(estimator):
+    words = [*DRIVE, "route.distance_m=8", f"estimator={estimator}"]
+    if estimator == "mcl":
+        start = ["prior.sigma_position_m=0.05", "prior.sigma_heading_rad=0.02"]
+        words += ["sensors=hokuyo", "prior.map=world", *start]
+    else:
+        words += ["sensors=stereo_pixel"]
+    rows = [
+        row
+        for seed in range(1000, 1030)
+        for row in evaluate(Experiment.compose([*words, f"seed={seed}"]))
+    ]
+    of = "revised_" if estimator == "smoother" else ""
+    for error, bound in (("ate_rmse_m", "bound_rmse_m"), ("heading_rmse_rad", "bound_heading_rad")):
+        squares = np.array([[row[of + error] ** 2, row[of + bound] ** 2] for row in rows])
+        assert over_bound(*squares.T)[1] > 0.01
+        drawn = np.random.default_rng(0).integers(len(rows), size=(2000, len(rows)))
+        errors, least = squares[drawn].sum(axis=1).T
+        assert np.quantile(errors / least, 0.975) > 1.0

@@ -1,0 +1,31 @@
+"""The study of alarms: what is planted, its table and its figure."""
+
+import numpy as np
+import pandas as pd
+
+from experiments.runs.experiment import Experiment
+from experiments.studies.self_knowledge import figures, study
+from tests.fixtures.fakes import circle
+
+
+def test_lifted_wheels_stand_for_a_part_of_the_drive():
+    recording = circle(seed=1, n_frames=240, kr=0.0, kl=0.0)
+    lifted = study.lift_wheels(recording)
+    whole, rest = (np.abs(np.diff(r.wheels.position_m[:, 0])) for r in (recording, lifted))
+    gone = rest < 0.5 * whole
+    assert 0.05 < gone[whole > 0.0].mean() < 0.15
+    np.testing.assert_allclose(rest[~gone], whole[~gone], atol=2.0 * whole.max())
+
+
+def test_a_misread_start_is_a_loss_that_odometry_misses(monkeypatch):
+    driven = circle(seed=1, n_frames=240, kr=5e-5, kl=5e-5)
+    monkeypatch.setattr(Experiment, "recording", lambda self: driven)
+    one = Experiment.compose(["study=self_knowledge", "estimator=odometry"])
+    table = pd.DataFrame(study.said([one])["said"])
+    losses = table[table["kind"] == "peaks"]
+    assert "start" in set(losses["planted"])
+    assert "nothing" not in set(losses["planted"])
+    curve = study.curves(table)
+    assert curve["missed"].iloc[-1] == 1.0  # without alarms
+    line = figures.draw_alarms(curve).axes[0].get_lines()[0]
+    assert line.get_label() == f"odometry ({len(losses)} losses)"
