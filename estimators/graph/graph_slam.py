@@ -93,8 +93,8 @@ class GraphSlamOptions(EncoderTickOptions, KeyFrameOptions, MatcherOptions, Loop
     """Leave out a line of which no three points in a row lie this near each other, m: door posts
     far behind one another do not make a wall. null: all lines are kept."""
     gate_probability: Probability | None = 1e-6
-    """Leave a registration out if only this share of all should differ more from what the wheels say,
-    which are never trusted beyond a twentieth of the way; null: all are used."""
+    """Leave a registration out if only this share of all should differ more from what the wheels
+    say, which are never trusted beyond a twentieth of the way; null: all are used."""
     shared_noise: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.75
     """Share of a registration's covariance that comes from the scans' own errors, half from
     each."""
@@ -279,7 +279,8 @@ class GraphSlam(GraphSlamOptions):
     def _doubt(self) -> Array:
         """Covariance (3, 3) below which wheels are not trusted where scans deny them."""
         x, y, turn = self._by_wheels.mean.tolist()
-        return (_FLOOR_SIGMA + _FLOOR_SHARE * (math.hypot(x, y) + abs(turn))) ** 2 * np.eye(3)
+        sigma = _FLOOR_SIGMA + _FLOOR_SHARE * (math.hypot(x, y) + abs(turn))
+        return np.diag([sigma**2] * 3)
 
     def _add_key_frame(self, scan: PreparedScan, registered: Gaussian | None) -> None:
         """Append a node, tied by the wheels and by its registration, and look for loops."""

@@ -227,9 +227,9 @@ class LoopSearch:
                 off = se2.between(at, se2.compose(graph.poses[other], its_pose))
                 if math.hypot(off[0], off[1]) > 1.0 or abs(off[2]) > 0.3:
                     return None
-        place = refine(new, patches.old(graph, anchor), pose)
+        refined = refine(new, patches.old(graph, anchor), pose)
         bend = patches.bend(graph, anchor, _OLD_M, _OLD_M) + patches.bend(graph, node, _NEW_M, 0.0)
-        return anchor, Gaussian(place.mean, place.covariance + bend)
+        return anchor, Gaussian(refined.mean, refined.covariance + bend)
 
     def on_path(self, path: Patch, scan: PreparedScan, expected: Gaussian) -> Gaussian | None:
         """Pose of a scan in the frame of a patch, near where it is expected; None if unclear."""

@@ -122,7 +122,7 @@ def find_places(
     for least in (floor, None):
         bound = floor if least is not None else 0.8 * found[0].score
         score, x, y, k = _search(
-            old.levels, old.cell_m, points, turns, box, expected.mean, information, bound, elsewhere
+            old, points, turns, box, expected.mean, information, bound, elsewhere
         )
         if k < 0:
             break
@@ -257,10 +257,11 @@ def _score(level: Values, cells: Ints, x: int, y: int) -> float:
 
 @njit(error_model="numpy")
 def _search(
-    levels: Values, cell_m: float, points: Array, turns: Array, box: Ints, mean: Array,
-    information: Array, floor: float, elsewhere: Array,
+    old: Patch, points: Array, turns: Array, box: Ints, mean: Array, information: Array,
+    floor: float, elsewhere: Array,
 ) -> tuple[float, float, float, int]:  # fmt: skip
     """The best score above a floor, its place x, y, m, and its heading's number, or -1."""
+    levels, cell_m = old.levels, old.cell_m
     cells = np.empty((len(turns), len(points), 2), np.int64)
     for t in range(len(turns)):
         cos, sin = math.cos(turns[t]), math.sin(turns[t])
