@@ -134,13 +134,21 @@ def _steps() -> Iterator[Measurement]:
 
 
 def cost_by_landmarks(n_repeats: int) -> pd.DataFrame:
-    """Time of a step against N, with either kind of map, resampling at every image."""
+    """Time of a step against N, with either kind of map, resampling at every image.
+
+    With known association, and by the Mahalanobis distance, for which every landmark near is asked.
+    """
     rows = []
-    for repeat, n, maps in itertools.product(range(n_repeats), _NS, ("shared", "contiguous")):
+    arms = itertools.product(range(n_repeats), _NS, ("shared", "contiguous"), ("known", "unknown"))
+    for repeat, n, maps, ids in arms:
         size: dict[str, Any] = {"n_landmarks": n, "n_seen": 20, "n_steps": n // 2 + 60}
-        seconds, _, _ = run_steps(1000, **size, maps=maps, **_PAPER)
+        how: dict[str, Any] = {}
+        if ids == "unknown":
+            how = {"association": "mahalanobis", "d0": 7.81}
+        seconds, _, _ = run_steps(1000, **size, maps=maps, **_PAPER, **how)
         ms = 1e3 * float(np.median(seconds[-50:]))  # in the second lap
-        rows.append({"repeat": repeat, "maps": maps, "n_landmarks": n, "step_ms": ms})
+        row = {"repeat": repeat, "maps": maps, "association": ids, "n_landmarks": n}
+        rows.append({**row, "step_ms": ms})
     return pd.DataFrame(rows)
 
 
@@ -152,7 +160,8 @@ def _by_size() -> Iterator[Measurement]:
         Measurement("fastslam.slope_m", log_log_slope(ms, by_m), "", note=f"M in {ms}"),
         Measurement("fastslam.slope_b", log_log_slope(bs, by_b), "", note=f"B in {bs}"),
     )
-    for maps, part in cost_by_landmarks(1).groupby("maps"):
+    known = cost_by_landmarks(1).query("association == 'known'")
+    for maps, part in known.groupby("maps"):
         exponent = log_log_slope(part["n_landmarks"], part["step_ms"])
         kib = run_steps(1000, **_SIZE, n_steps=100, maps=maps)[2] / 1024
         note = f"N in {_NS}, resampling at every image"

@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -57,7 +57,13 @@ def sample_scenes(
 
 
 def measure(
-    scene: ScanScene, laser: Laser, rng: np.random.Generator, n_repeats: int, n_sampled: int
+    scene: ScanScene,
+    laser: Laser,
+    rng: np.random.Generator,
+    n_repeats: int,
+    n_sampled: int,
+    metrics: Sequence[Metric] = METRICS,
+    rules: Rules = DEFAULT_RULES,
 ) -> pd.DataFrame:
     """Rows (metric x method): NEES over dof, determinants, errors, bias along the motion, times.
 
@@ -70,15 +76,17 @@ def measure(
     truth = se2.between(scene.T_w_target, scene.T_w_source)
     bound = fisher_bound(scene.walls, scene.T_w_target, scene.T_w_source, bearings, sigma)
     clean = [cast(scene.walls, pose, bearings)[0] for pose in (scene.T_w_target, scene.T_w_source)]
-    matches: dict[Metric, list[tuple[float, ...]]] = {metric: [] for metric in METRICS}
+    matches: dict[Metric, list[tuple[float, ...]]] = {metric: [] for metric in metrics}
     tried: dict[tuple[Metric, str], list[tuple[float, ...]]] = {}
     for repeat in range(n_repeats):
         noisy = [ranges + sigma * rng.standard_normal(len(ranges)) for ranges in clean]
         target, source = (prepare(ranges, bearings, laser.max_range_m) for ranges in noisy)
         guess = truth + _GUESS_SIGMA * rng.standard_normal(3)
-        for metric in METRICS:
+        for metric in metrics:
             begun = time.perf_counter()
-            found = register(source, target, guess, metric=metric, gate_m=0.6, gate_rad=0.06)
+            found = register(
+                source, target, guess, metric=metric, gate_m=0.6, gate_rad=0.06, rules=rules
+            )
             took = time.perf_counter() - begun
             off = found.T_target_source - truth
             off[2] = math.remainder(off[2], 2.0 * math.pi)

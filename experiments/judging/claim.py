@@ -13,10 +13,17 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import stats
 
-from experiments.evaluation.statistics import Interval, log_ratio_interval, wilcoxon_p
+from experiments.evaluation.statistics import (
+    Interval,
+    log_ratio_interval,
+    share_interval,
+    wilcoxon_p,
+)
 
 EQUIVALENCE = "equivalence"  # as an effect in words
 SMALLEST_EFFECT = 0.1  # of interest, where nothing speaks for another: a ratio of 1.1
+WAITS = "waits"  # quantity of a claim whose tables are older than its definition
+OWN_DESIGN = "own design"  # quantity of what the paper's own design shows
 
 
 class Verdict(StrEnum):
@@ -220,6 +227,34 @@ def shown(about: Subject, statistic: str, found: Interval, reason: str = "", **f
     """State a statistic that accompanies a claim and has no criterion."""
     ruling = ("shown, not judged", Verdict.SHOWN, reason, Role.BESIDE)
     return Claim(about, statistic, found, *ruling, facts=facts)
+
+
+def waiting(claim: str) -> Claim:
+    """State that a claim waits for the judged run, since its tables are older than its definition.
+
+    Its verdict is `shown`, as it has no headline.
+    """
+    said = "not judged yet by its present definition"
+    return shown(Subject(claim, WAITS), said, Interval(math.nan, math.nan, math.nan))
+
+
+def own_design(claim: str, design: str, hits: ArrayLike) -> Claim:
+    """State how often the paper's own design shows what the paper says.
+
+    Parameters
+    ----------
+    design
+        In words, such as "one drive".
+    hits
+        Whether each recording alone shows it (N,).
+    """
+    shows = np.asarray(hits, bool)
+    share = share_interval(int(shows.sum()), len(shows))
+    said = (
+        f"The paper's own design, {design}, shows it in {int(shows.sum())} of {len(shows)} cases."
+    )
+    about = Subject(claim, OWN_DESIGN, arm=design)
+    return shown(about, f"share of cases in which {design} shows it", share, said)
 
 
 def beside(claim: Claim, is_beside: bool = True) -> Claim:

@@ -44,4 +44,21 @@ def findings(study: str) -> dict[str, Any]:
     found = read_yaml(path) if path.exists() else {}
     empty = {"title": study, "claims": {}, "own": [], "sentences": {}, "figures": {}}
     empty |= dict.fromkeys(("about", "source", "doi"), "")
-    return {**empty, **found}
+    whole = {**empty, **found}
+    pages = {f"{study}_region_{claim}": _region_page(claim) for claim in whole.get("regions", {})}
+    return whole | {"figures": {**whole["figures"], **pages}}
+
+
+def _region_page(claim: str) -> dict[str, Any]:
+    """What the report says of the figure of a claim's region."""
+    return {
+        "title": f"Where {claim} holds",
+        "alt": (
+            f"Left, where {claim} holds over the two settings that decide it most, with the "
+            "boundary and its interval, the sampled points and the anchor. Middle, the first "
+            "headline's ratio along the first of them, with the criterion. Right, the first-order "
+            "index of each free setting with its interval."
+        ),
+        "paper": "The paper leaves these settings open; this figure adds them.",
+        "claims": [claim],
+    }

@@ -5,17 +5,21 @@ They stand in the study's findings.yaml beside the claims, fixed before the judg
     regions:
       MX1:
         effect: 0.1 # smallest of interest, a ratio less one
+        printed: # level of the reference arm, and where it comes out on tuning seeds
+          Oxford: {column: oxford_m2_m, value: 9.61, anchor: {...}, level: 9.5}
         settings:
           estimator.n_nearest: {low: 2, high: 20, scale: integer, source: "..."}
           estimator.noise_at: {choices: [measured, predicted], source: "..."}
+      MX3: {like: MX1} # the same settings and runs
+      MX9: {like: MX1, is_alone: true} # judged by its region alone, without an anchor
 
-The names are configuration keys. They stand there, not in conf/study, as they belong to a claim,
-and a claim's runs may be composed from several of those files.
+The names are configuration keys, or say what they stand for. They stand there, not in conf/study,
+as they belong to a claim, and a claim's runs may be composed from several of those files.
 """
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import Any
 
@@ -86,11 +90,84 @@ class Setting:
 
 
 @dataclass(frozen=True)
+class Anchor:
+    """Settings at which the reference arm has its printed level, and the level there.
+
+    Where nothing is printed, the settings are the middle of the ranges, and the level is NaN.
+    """
+
+    settings: Mapping[str, Any]
+    level: float = math.nan
+
+    @property
+    def words(self) -> str:
+        """The settings in words."""
+        return ", ".join(
+            f"{name} = {value:.3g}" if isinstance(value, float) else f"{name} = {value}"
+            for name, value in self.settings.items()
+        )
+
+
+@dataclass(frozen=True)
+class Printed:
+    """A level of the reference arm that the paper prints.
+
+    Attributes
+    ----------
+    column
+        Of the region's runs, with that level.
+    anchor
+        Where it comes out on tuning seeds; None: nowhere.
+    """
+
+    column: str
+    value: float
+    anchor: Anchor | None
+
+
+@dataclass(frozen=True)
 class FreeSettings:
-    """The free settings of a claim, and the smallest effect of interest, a ratio less one."""
+    """The free settings of a claim.
+
+    Attributes
+    ----------
+    runs
+        The claim whose runs over the region these are.
+    effect
+        Smallest effect of interest, a ratio less one.
+    printed
+        Printed levels by where they apply, such as a data set.
+    is_alone
+        Whether the claim is judged by its region alone, as it is about the printed level itself.
+    """
 
     settings: tuple[Setting, ...]
+    runs: str
     effect: float = SMALLEST_EFFECT
+    printed: Mapping[str, Printed] = field(default_factory=dict)
+    is_alone: bool = False
+
+    @property
+    def anchor(self) -> Anchor | None:
+        """The anchor, of several data sets together; None for a claim that has none."""
+        if self.is_alone:
+            return None
+        if not self.printed:
+            return middle(self.settings)
+        known = {place: each.anchor for place, each in self.printed.items() if each.anchor}
+        one = len(self.printed) == 1
+        settings = {
+            name if one else f"{name} ({place})": value
+            for place, anchor in known.items()
+            for name, value in anchor.settings.items()
+        }
+        return Anchor(settings, min(a.level for a in known.values())) if known else None
+
+    @property
+    def drawn_anchor(self) -> Anchor | None:
+        """The anchor that a figure shows: of several data sets, the first one's."""
+        first = next(iter(self.printed.values()), None)
+        return first.anchor if first and not self.is_alone else self.anchor
 
 
 def free_settings(study: str) -> dict[str, FreeSettings]:
@@ -102,18 +179,39 @@ def free_settings(study: str) -> dict[str, FreeSettings]:
         If they belong to no claim, or a range is empty, of an unknown scale, or without a source.
     """
     about = findings(study)
-    found = {}
+    found: dict[str, FreeSettings] = {}
     for claim, given in about.get("regions", {}).items():
         where = f"{study}/findings.yaml: regions.{claim}"
         require(claim in about["claims"], f"{where}: no such claim")
+        effect = number(given.get("effect", SMALLEST_EFFECT), f"{where}.effect")
+        require(effect > 0.0, f"{where}.effect must be > 0")
+        is_alone = bool(given.get("is_alone"))
+        if "like" in given:
+            require(given["like"] in found, f"{where}.like: no region before it has that name")
+            first = found[given["like"]]
+            found[claim] = replace(first, effect=effect, is_alone=is_alone)
+            continue
         require(isinstance(given, dict) and given.get("settings"), f"{where}: needs settings")
         settings = tuple(
             _setting(name, of, f"{where}.settings.{name}") for name, of in given["settings"].items()
         )
-        effect = number(given.get("effect", SMALLEST_EFFECT), f"{where}.effect")
-        require(effect > 0.0, f"{where}.effect must be > 0")
-        found[claim] = FreeSettings(settings, effect)
+        printed = {
+            str(place): _printed(of, settings, f"{where}.printed.{place}")
+            for place, of in given.get("printed", {}).items()
+        }
+        found[claim] = FreeSettings(settings, claim, effect, printed, is_alone)
     return found
+
+
+def _printed(given: Any, settings: Sequence[Setting], where: str) -> Printed:
+    require(isinstance(given, dict) and given.get("column"), f"{where}: needs a column")
+    value, at = number(given.get("value"), f"{where}.value"), given.get("anchor")
+    require(value > 0.0, f"{where}.value must be > 0")
+    if at is None:
+        return Printed(str(given["column"]), value, None)
+    names = [each.name for each in settings]
+    require(list(at) == names, f"{where}.anchor must set {', '.join(names)}, in this order")
+    return Printed(str(given["column"]), value, Anchor(at, number(given["level"], where)))
 
 
 def _setting(name: str, given: Any, where: str) -> Setting:
@@ -161,25 +259,6 @@ def sample(
     require(n > 0 and n & (n - 1) == 0, f"a Sobol sample has a power of two points, not {n}")
     points = qmc.Sobol(len(settings), scramble=rng is not None, rng=rng).random(n)
     return table_at(settings, points if rng else points + 0.5 / n)
-
-
-@dataclass(frozen=True)
-class Anchor:
-    """Settings at which the reference arm has its printed level, and the level there.
-
-    Where nothing is printed, the settings are the middle of the ranges, and the level is NaN.
-    """
-
-    settings: Mapping[str, Any]
-    level: float = math.nan
-
-    @property
-    def words(self) -> str:
-        """The settings in words."""
-        return ", ".join(
-            f"{name} = {value:.3g}" if isinstance(value, float) else f"{name} = {value}"
-            for name, value in self.settings.items()
-        )
 
 
 def middle(settings: Sequence[Setting]) -> Anchor:

@@ -96,7 +96,10 @@ def _joined(parts: list[Any]) -> pd.DataFrame:
 
 
 def answer_of(
-    experiment: Experiment, names: Collection[str], fetch: Callable[[], Team] | None = None
+    experiment: Experiment,
+    names: Collection[str],
+    fetch: Callable[[], Team] | None = None,
+    **how: Any,
 ) -> Row:
     """Those columns of an experiment's one row, or of its best answer, that it has.
 
@@ -104,10 +107,10 @@ def answer_of(
     ----------
     names
         As for `experiments.sweeps.collect.with_answers`.
-    fetch
+    fetch, how
         As for `experiments.runs.evaluate.evaluate`.
     """
-    found = with_answers(pd.DataFrame(evaluate(experiment, fetch)), list(names)).iloc[0]
+    found = with_answers(pd.DataFrame(evaluate(experiment, fetch, **how)), list(names)).iloc[0]
     return {name: found[name] for name in names if name in found}
 
 

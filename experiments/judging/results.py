@@ -35,10 +35,13 @@ def write_table(frame: pd.DataFrame, path: Path) -> None:
 
 
 class Profile(StrEnum):
-    """The size of a study: `quick` makes every table and figure from few repeats."""
+    """The size of a study: `quick` makes all from few repeats, on tuning seeds."""
 
     FULL = "full"
     QUICK = "quick"
+
+
+FIRST_SEED = {Profile.FULL: 2000, Profile.QUICK: 0}  # of the worlds; those below 100 are for tuning
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,8 @@ from jinja2 import Environment, StrictUndefined
 from experiments.evaluation.statistics import Interval
 from experiments.judging.claim import (
     EQUIVALENCE,
+    OWN_DESIGN,
+    WAITS,
     Claim,
     Role,
     Verdict,
@@ -24,6 +26,10 @@ from experiments.judging.claim import (
     select_all,
 )
 from experiments.judging.region import Region, rule
+
+WAITING = (
+    "Its definition has changed (see the errata), and it waits for the judged run on new worlds."
+)
 
 
 @dataclass(frozen=True)
@@ -46,8 +52,9 @@ def conclude(
 
     The verdict follows from the headlines alone, and from the region of free settings if the claim
     has one; the headlines are then those at its anchor, and the sentence says what decides.
-    Without headlines or region a claim is shown. If it is undecided, the sentence also says with
-    what power data of that size decide.
+    Without headlines or region a claim is shown, as is one that waits for the judged run. The
+    sentence also states what the paper's own design shows and, of an undecided claim, with what
+    power data of that size decide.
 
     Parameters
     ----------
@@ -62,7 +69,12 @@ def conclude(
     conclusions = []
     for key, rows in by_id.items():
         verdict = at_anchor = headline_verdict([(row.role, row.verdict) for row in rows])
+        if select_all(rows, quantity=WAITS):
+            conclusions.append(Conclusion(key, verdict, WAITING))
+            continue
+        own = [row.reason for row in select_all(rows, quantity=OWN_DESIGN)]
         said, region = sentence(findings["sentences"][key], rows), regions.get(key)
+        said = " ".join([said, *own])
         if region:
             verdict, said = rule(at_anchor, region.share), f"{said} {region.words(at_anchor)}"
         if verdict is Verdict.UNDECIDED:

@@ -8,11 +8,12 @@ all looks.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
+import pandas as pd
 from numpy.typing import ArrayLike
 
 from experiments.evaluation.sequential import SPENT, look_errors, power_at, repeated_interval
@@ -29,9 +30,11 @@ from experiments.judging.claim import (
     power_of,
 )
 from experiments.judging.folders import findings
+from experiments.judging.results import FIRST_SEED, Profile
 from sim.errors import InputError, require
 
 T = TypeVar("T")
+N_QUICK = 3  # worlds of the quick profile
 
 
 @dataclass(frozen=True)
@@ -157,3 +160,36 @@ def run_until_decided(
         if not any(c.role is Role.HEADLINE and c.facts.get("is_open") for c in claims):
             break
     return results, claims
+
+
+def run_worlds(
+    study: str,
+    claims: Sequence[str],
+    profile: Profile,
+    rows_of: Callable[[Sequence[int]], Mapping[str, pd.DataFrame]],
+    judge: Callable[[Mapping[str, pd.DataFrame]], Sequence[Claim]],
+) -> dict[str, pd.DataFrame]:
+    """Run the worlds of claims that share tables until all are decided by their designs.
+
+    Each claim is judged at its own looks. The quick profile has a few worlds of tuning seeds.
+
+    Parameters
+    ----------
+    rows_of
+        Gives the tables of the worlds with these seeds.
+    """
+    given = [each for name, each in designs(study).items() if name in claims]
+    looks = sorted({n for each in given for n in each.looks})
+    looks = looks if profile is Profile.FULL else [N_QUICK]
+    first, tables, done = FIRST_SEED[profile], dict[str, pd.DataFrame](), 0
+
+    def run_to(n: int) -> Mapping[str, pd.DataFrame]:
+        nonlocal done
+        for name, new in rows_of(range(first + done, first + n)).items():
+            both = [tables[name], new] if name in tables else [new]
+            tables[name] = pd.concat(both, ignore_index=True)
+        done = n
+        return tables
+
+    run_until_decided(looks, run_to, judge)
+    return tables

@@ -11,7 +11,6 @@ from experiments.papers.decristoforis2020 import study as decristoforis2020
 from experiments.papers.gil2008 import study
 from experiments.papers.gil2008.recordings import Scene
 from experiments.papers.maximo2024 import worlds
-from experiments.papers.maximo2024.settings import GRID_B, METHODS, QUALITIES
 from experiments.papers.puzzlebot2024 import study as puzzlebot2024
 from experiments.runs.experiment import Experiment
 from experiments.studies.real_logs.settings import FUSION, INTEL
@@ -169,13 +168,6 @@ def test_offices_and_corridors_of_decristoforis2020_differ_from_seed_to_seed():
         assert len({world.places[place].tobytes() for world in worlds}) == 3
 
 
-def test_every_point_of_the_ordering_has_all_methods_over_one_drive():
-    for group in decristoforis2020._planned("ordering", 1):
-        assert differing(group) == {"method"}
-        assert {run.config["method"] for run in group} >= set(decristoforis2020.CHECKED)
-
-
-@pytest.mark.slow
 def test_metrics_register_the_same_scans(monkeypatch):
     asked = []
 
@@ -290,14 +282,6 @@ def test_weightings_of_maximo2024_differ_in_nothing_else(asked):
     worlds.weighting_rows(worlds.make_case("umh", 5), 1)
     assert_alike(asked, "weighting")
     assert [settings["weighting"] for settings, *_ in asked] == ["M1", "M2", "M3"]
-
-
-def test_every_cell_of_the_map_compares_the_same_runs(asked):
-    list(worlds.quality_rows("umh", 5))
-    n = len(GRID_B) * len(METHODS)
-    assert len(asked) == n * len(QUALITIES)
-    for start in range(0, len(asked), n):
-        assert_alike(asked[start : start + n], "weighting", "n_nearest")
 
 
 def test_numbers_of_particles_are_compared_over_the_same_queries(asked):

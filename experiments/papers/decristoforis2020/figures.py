@@ -1,19 +1,18 @@
 """The figures of decristoforis2020, and those that our studies add."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
-from matplotlib.colors import TwoSlopeNorm
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from experiments.evaluation.registration_errors import METRICS
 from experiments.evaluation.statistics import log_ratio_interval
+from experiments.judging.region_runs import region_pages
 from experiments.judging.results import Arrays, Results
-from experiments.papers.decristoforis2020.claims import judged_runs, nees_intervals
+from experiments.papers.decristoforis2020.claims import HEADLINES, judged_runs, nees_intervals
 from experiments.papers.decristoforis2020.settings import CONSISTENT, PAPERS_OWN, PLACES
 from experiments.viewing.plotting import (
     draw_dots,
@@ -78,12 +77,12 @@ def draw(results: Results) -> dict[str, Figure]:
         "runs": runs(table),
         "covariances": covariances(results.table("covariances")),
         "beliefs": beliefs(results.table("beliefs")),
-        "ordering": ordering(results.table("ordering")),
         "steps": steps(results.table("steps")),
     }
     if results.has_arrays("log"):  # which is written where the log is
         pages["log"] = real_log(results.arrays("log"), results.table("log_boxes"))
-    return {f"{results.paper}_{name}": page for name, page in pages.items()}
+    own = {f"{results.paper}_{name}": page for name, page in pages.items()}
+    return own | region_pages(results, HEADLINES)
 
 
 def route(office: Arrays) -> Figure:
@@ -340,61 +339,6 @@ def _belief(name: str) -> str:
     )
 
 
-def ordering(table: pd.DataFrame) -> Figure:
-    """Where fusion beats ICP, and ICP odometry: ratios with intervals over slip and range noise."""
-    page, axes = subplots(11.0, 6.0, 2, 3, sharex=True, sharey=True)
-    pairs = (("fusion", "icp"), ("icp", "odometry"), ("fusion_clone", "fusion"))
-    errors = (("ate_rmse_m", "position"), ("heading_rmse_rad", "heading"))
-    cells = ["k_m", "sigma_range_m"]
-    for row, (column, what) in zip(axes, errors, strict=True):
-        wide = table.pivot(index=[*cells, "seed"], columns="method", values=column)
-        for ax, (better, worse) in zip(row, pairs, strict=True):
-            found = wide.groupby(level=cells).apply(
-                lambda part, a=better, b=worse: pd.Series(
-                    vars(log_ratio_interval(part[a], part[b]))
-                )
-            )
-            drawn = _grid(ax, found)
-            ax.set_title(f"{what}: {NAMES[better]} over {NAMES[worse]}", fontsize=8)
-            ax.set(xlabel="kr = kl, m", ylabel="range noise, m")
-            ax.label_outer()
-    label = "natural log of the mean ratio of RMSE (blue: the first is better)"
-    page.colorbar(drawn, ax=axes, label=label, extend="both")
-    page.suptitle(
-        "mean ratio of errors, 95 % interval below; line: where the order turns; bold: the "
-        "interval lies clear of 1",
-        size=9,
-    )
-    return page
-
-
-def _grid(ax: Axes, found: pd.DataFrame) -> Any:
-    """Cells of ratios with their intervals, and the boundary at which the ratio is 1."""
-    ratio, low, high = (found[name].unstack("k_m") for name in ("value", "low", "high"))
-    logs = np.log(ratio.to_numpy())
-    norm = TwoSlopeNorm(0.0, -3.0, 3.0)
-    drawn = ax.imshow(logs, cmap="RdBu_r", norm=norm, origin="lower", aspect="auto")
-    for (i, j), value in np.ndenumerate(logs):
-        color = "white" if abs(value) > 2.0 else "black"
-        ends = low.iat[i, j], high.iat[i, j]
-        clear = "bold" if ends[0] > 1.0 or ends[1] < 1.0 else "normal"
-        text = f"{_short(ratio.iat[i, j])}\n{_short(ends[0])}–{_short(ends[1])}"
-        ax.text(j, i, text, ha="center", va="center", size=6, color=color, weight=clear)
-    below = logs < 0.0  # the boundary runs along the edges of cells
-    for i, j in np.argwhere(below[:, 1:] != below[:, :-1]):
-        ax.plot([j + 0.5, j + 0.5], [i - 0.5, i + 0.5], color=TRUTH, lw=2.0)
-    for i, j in np.argwhere(below[1:] != below[:-1]):
-        ax.plot([j - 0.5, j + 0.5], [i + 0.5, i + 0.5], color=TRUTH, lw=2.0)
-    ax.set_xticks(range(logs.shape[1]), [f"{k:g}" for k in ratio.columns], fontsize=7)
-    ax.set_yticks(range(logs.shape[0]), [f"{s:g}" for s in ratio.index], fontsize=7)
-    return drawn
-
-
-def _short(ratio: float) -> str:
-    """Write a ratio in few characters."""
-    return f"{ratio:.0f}" if ratio >= 10.0 else f"{ratio:.{1 if ratio < 0.1 else 2}g}"
-
-
 def steps(table: pd.DataFrame) -> Figure:
     """Registrations from scan to scan: correlation, accumulation, and the least possible error."""
     page, axes = subplots(9.5, 3.8, 1, 3)
@@ -407,7 +351,9 @@ def steps(table: pd.DataFrame) -> Figure:
         (["nees_over_3", *(f"accumulated_over_predicted_{w}s" for w in ("1", "10"))], 0.0),
         (["position", "heading"], 0.0),
     )
-    for rate, color, shift in ((10.0, BLUE, -0.06), (75.0, ORANGE, 0.06)):
+    for rate, color, shift in zip(
+        sorted(rows["rate_hz"].unique()), (BLUE, ORANGE), (-0.06, 0.06), strict=True
+    ):
         for ax, (columns, first) in zip(axes, panels, strict=True):
             values = rows.loc[rows["rate_hz"] == rate, columns]
             at, middle = first + shift + np.arange(len(columns)), values.median()

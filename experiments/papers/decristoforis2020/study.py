@@ -4,44 +4,52 @@ Drives are simulated with the kinematic body, which slips by the same law as the
 half the time; a few with the rigid body and its rays stand beside.
 """
 
-import math
 import operator
-import timeit
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
-from typing import Any
+from itertools import accumulate
+from typing import Any, cast
 
 import numpy as np
 import pandas as pd
 from matplotlib.cbook import boxplot_stats
 
 from estimators.base import Estimate
-from estimators.laser.icp import prepare, register
+from estimators.laser.icp import DEFAULT_RULES, Rules
 from estimators.laser.icp_covariance import Scans
-from experiments.bench.icp import BEARINGS_RAD, pair
 from experiments.evaluation.map_quality import map_points, mean_map_entropy, wall_distances_m
 from experiments.evaluation.metrics import (
     heading_errors_rad,
     nees_at_distances,
     position_errors_m,
 )
-from experiments.evaluation.registration_errors import METRICS, measure, sample_scenes
+from experiments.judging.claim import Claim
+from experiments.judging.free_settings import free_settings
 from experiments.judging.jobs import Progress, Tables, group_by, tables_of
 from experiments.judging.logs import DATA
+from experiments.judging.region_runs import region_jobs, remake_region
 from experiments.judging.remake import Cells, Remake
-from experiments.judging.results import Profile, Results
-from experiments.papers.decristoforis2020.claims import judged_runs
+from experiments.judging.results import FIRST_SEED, Profile, Results
+from experiments.judging.sequential import run_worlds
+from experiments.papers.decristoforis2020.claims import dc1, dc3, dc5, dc6, judged_runs
+from experiments.papers.decristoforis2020.pairs import (
+    covariance_levels,
+    covariances_of,
+    metrics_of,
+)
 from experiments.papers.decristoforis2020.settings import (
     CHECKED,
-    JUDGED_SEED,
-    N_DRIVES,
+    HALVINGS,
     N_GEOMETRIES,
     N_REPEATS,
     NEES_AT_M,
+    ONE_DEGREE_BEAMS,
     PAIRS,
     PAPERS_OWN,
     PLACES,
-    RATE_HZ,
+    QUARTER_HZ,
+    TURNS_HZ,
 )
 from experiments.papers.decristoforis2020.steps import ellipse_path, ellipse_summary, step_errors
 from experiments.runs.console import RunFailedError
@@ -50,12 +58,16 @@ from experiments.runs.experiment import Experiment
 from experiments.runs.row import Outcome, Row
 from experiments.runs.seeds import stream
 from experiments.sweeps.plan import plan_experiments
+from sim import se2
 from sim.arrays import Array
 from sim.recording import Recording
-from sim.sensors import Laser, sensor_of
+from sim.sensors import Laser
 from sim.team import Team
 
 Job = tuple[float, Callable[..., Tables], Sequence[Any]]  # cost, function, arguments
+Call = tuple[Any, ...]  # function, arguments
+JobsOf = Callable[[Sequence[int]], list[Call]]
+Judge = Callable[[Mapping[str, pd.DataFrame]], Sequence[Claim]]
 
 _RUN = {
     "seed": "seed",
@@ -67,12 +79,6 @@ _BELIEF = {"seed": "seed", "belief": "belief"}
 _ADJUSTED = {
     name: f"estimator.{name}" for name in ("acceleration_noise", "turn_noise")
 }  # by experiment, as the paper says
-_NOISE = {
-    "seed": "seed",
-    "k_m": "robot.kr",
-    "sigma_range_m": "sensors.laser.sigma_range_m",
-    "method": "method",
-}
 
 
 def run(profile: Profile, out: Results, on_progress: Progress) -> None:
@@ -83,9 +89,16 @@ def run(profile: Profile, out: Results, on_progress: Progress) -> None:
     profile
         `quick`: few and short recordings; `full`: those that the claims are judged on.
     """
-    costs, functions, arguments = zip(*_jobs(profile is Profile.FULL, out), strict=True)
-    calls = [(function, *given) for function, given in zip(functions, arguments, strict=True)]
-    whole = tables_of(operator.call, calls, on_progress, costs)
+    fixed, regions = _jobs(profile, out), region_jobs("decristoforis2020", region_run, profile)
+    calls = [(function, *given) for _, function, given in fixed] + regions
+    costs = [cost for cost, *_ in fixed] + len(regions) * [0.1]
+    whole = tables_of(operator.call, calls, lambda share: on_progress(0.6 * share), costs)
+    for claims, jobs_of, judge in _designed(profile):
+        made = run_worlds("decristoforis2020", claims, profile, partial(_block, jobs_of), judge)
+        for name, table in made.items():
+            both = [whole[name], table] if name in whole else [table]
+            whole[name] = pd.concat(both, ignore_index=True)
+    on_progress(0.95)
     whole["boxes"] = _boxes(judged_runs(whole.pop("errors")))
     if "log_errors" in whole:
         whole["log_boxes"] = _boxes(whole.pop("log_errors"))
@@ -93,21 +106,89 @@ def run(profile: Profile, out: Results, on_progress: Progress) -> None:
     by_noise = whole["process_noise"].groupby(list(_ADJUSTED), as_index=False)
     whole["process_noise"] = by_noise[scores].mean()
     whole["covariances"] = whole["covariances"].sort_values(["metric", "method", "place", "seed"])
-    whole["ordering"] = whole["ordering"][[*_NOISE, "ate_rmse_m", "heading_rmse_rad"]]
     out.write_tables(**whole)
+    on_progress(1.0)
 
 
-def _jobs(full: bool, out: Results) -> list[Job]:
-    """Jobs of all studies; a drive of 100 m through an office costs 1."""
-    n, n_drives = (N_GEOMETRIES, N_DRIVES) if full else (4, 4)
-    drive, slow, drawn = (1.0, 0.2, 2.5) if full else (0.15, 0.1, 0.6)
+def _designed(profile: Profile) -> list[tuple[list[str], JobsOf, Judge]]:
+    """Claims whose worlds are added until they are decided: their jobs by seeds, and judgement."""
+    short = [] if profile is Profile.FULL else ["route.distance_m=8.0"]
+    return [
+        (["DC1", "DC6"], partial(_drives, short), lambda t: [*dc1(t["runs"]), *dc6(t["runs"])]),
+        (["DC3"], _corridors, lambda t: dc3(t["ellipses"])),
+        (["DC5"], _pairs, lambda t: list(dc5(t["metrics"]))),
+    ]
+
+
+def _block(jobs_of: JobsOf, seeds: Sequence[int]) -> dict[str, pd.DataFrame]:
+    return tables_of(operator.call, jobs_of(seeds))
+
+
+def _drives(short: Sequence[str], seeds: Sequence[int]) -> list[Call]:
+    return [(_drive, group) for group in _planned("methods", seeds, *anchored("DC1"), *short)]
+
+
+def _corridors(seeds: Sequence[int]) -> list[Call]:
+    return [(_closeup, group) for group in _planned("corridor", seeds)]
+
+
+def _pairs(seeds: Sequence[int]) -> list[Call]:
+    return [(metrics_of, seed, kind, DEFAULT_RULES) for seed in seeds for kind in PAIRS]
+
+
+def anchored(claim: str) -> list[str]:
+    """Overrides of the configuration at a claim's anchor."""
+    anchor = free_settings("decristoforis2020")[claim].anchor
+    return overrides_at(anchor.settings if anchor else {})
+
+
+def overrides_at(values: Mapping[str, Any]) -> list[str]:
+    """Overrides at free settings: both wheels slip alike, and the laser has its beams' turns."""
+    given = [f"{name}={value}" for name, value in values.items() if name != HALVINGS]
+    if "robot.kr" in values:
+        given.append(f"robot.kl={values['robot.kr']}")
+    if HALVINGS in values:
+        rate_hz = TURNS_HZ / 2.0 ** int(values[HALVINGS])
+        given.append(f"sensors.laser.rate_hz={rate_hz}")
+        given += [f"sensors.laser.n_beams={ONE_DEGREE_BEAMS}"] * (rate_hz > QUARTER_HZ)
+    return given
+
+
+def region_run(name: str, values: Mapping[str, Any], seed: int, profile: Profile) -> Row:
+    """Levels of a claim's arms at free settings in one world."""
+    if name == "DC4":
+        return covariance_levels(values, seed, N_REPEATS if profile is Profile.FULL else 12)
+    if name == "DC5":
+        rules = Rules(neighbours=int(values["estimator.neighbours"]))
+        rows = metrics_of(seed, values["pair of scans"], rules)["metrics"]
+        kinds = {"point_to_plane": "plane", "point_to_point": "point"}
+        return {
+            f"{kinds[row['metric']]}_{key}": max(float(cast(float, row[key])), 1e-9)
+            for row in rows
+            if row["metric"] in kinds
+            for key in ("error_m", "error_rad", "time_us")
+        }
+    if name == "DC2":
+        (group,) = _planned("corridor", [seed], *overrides_at(values))
+        row = _closeup([one for one in group if one.label("method") == "printed"])["ellipses"]
+        return dict(pd.DataFrame(row).iloc[0].drop(["seed", "method"]))
+    length_m = 20.0 if profile is Profile.FULL else 8.0
+    (group,) = _planned("methods", [seed], *overrides_at(values), f"route.distance_m={length_m}")
+    runs = pd.DataFrame(_drive(_only(PAPERS_OWN, group))["runs"]).set_index("method")
+    columns = ("ate_rmse_m", "heading_rmse_rad", "map_distance_m")
+    return {f"{m}_{column}": float(runs.loc[m, column]) for m in PAPERS_OWN for column in columns}
+
+
+def _jobs(profile: Profile, out: Results) -> list[Job]:
+    """Jobs whose number is fixed; a drive of 100 m through an office costs 1."""
+    full, first = profile is Profile.FULL, FIRST_SEED[profile]
+    n, slow, drawn = (N_GEOMETRIES, 0.2, 2.5) if full else (4, 0.1, 0.6)
     short, shorter = ([], []) if full else (["route.distance_m=8.0"], ["sensors.laser.rate_hz=5.0"])
     ten_hz = ["sensors.laser.rate_hz=10.0", *short]
     engine = ["simulation.physics=bullet", "simulation.rays=bullet"]
-    noise = [] if full else ["robot.kr=1e-6,1e-4", "sensors.laser.sigma_range_m=0.01"]
-    seeds = range(JUDGED_SEED, JUDGED_SEED + n)
-    (office,) = _planned("methods", 1, "route.distance_m=300.0", *shorter)
-    first, *others = _planned("corridor", n)
+    at = anchored("DC1")
+    (office,) = _planned("methods", [first], *at, "route.distance_m=300.0", *shorter)
+    (corridor,) = _planned("corridor", [first])
     adjusted = group_by(
         plan_experiments(
             ["study=decristoforis2020/tuning", *([] if full else ["seed=60", *short])]
@@ -115,37 +196,27 @@ def _jobs(full: bool, out: Results) -> list[Job]:
         lambda run: run.recording_key,
     )
     on_log = list(plan_experiments(["study=decristoforis2020/log"])) if DATA.is_dir() else []
+    few, fewer = range(first, first + (3 if full else 1)), range(first, first + (2 if full else 1))
     return [
         (drawn, _drawn_office, [_only(PAPERS_OWN, office), out]),
         *((0.5, _drawn_log, [group, out]) for group in ([on_log] if on_log else [])),
-        *((drive, _drive, [group]) for group in _planned("methods", n_drives, *short)),
         *(
             (slow, _drive, [_only(CHECKED, group)])
             for group in (
-                *_planned("methods", 3 if full else 1, *ten_hz),
-                *_planned("methods", 2 if full else 1, *ten_hz, *engine),
+                *_planned("methods", few, *at, *ten_hz),
+                *_planned("methods", fewer, *at, *ten_hz, *engine),
             )
         ),
         *(
             (slow, _scored, ["beliefs", _BELIEF, group])
-            for group in _planned("beliefs", n // 4, *short)
+            for group in _planned("beliefs", range(first, first + n // 4), *short)
         ),
-        *((0.5 * drive, _scored, ["process_noise", _ADJUSTED, group]) for group in adjusted),
-        (0.2, _closeup, [first, out]),
-        *((0.2, _closeup, [group]) for group in others),
+        *((0.5 * slow, _scored, ["process_noise", _ADJUSTED, group]) for group in adjusted),
+        (0.2, _drawn_corridor, [corridor, out]),
         *(
-            (0.1, _scenes, [seed, place, N_REPEATS if full else 6])
-            for seed in seeds
+            (0.1, covariances_of, [seed, place, N_REPEATS if full else 6])
+            for seed in range(first, first + n)
             for place in PLACES
-        ),
-        *(
-            (0.005, _metrics, [seed, kind])
-            for seed in range(JUDGED_SEED, JUDGED_SEED + 5 * n)
-            for kind in PAIRS
-        ),
-        *(
-            (0.2, _scored, ["ordering", _NOISE, _only(CHECKED, group)])
-            for group in _planned("ordering", 5 if full else 1, *noise, *short)
         ),
     ]
 
@@ -156,33 +227,38 @@ REMADE = {
     "covariances": 3.0,
     "ellipses": 3.5,
     "beliefs": 10.0,
-    "ordering": 2.0,
     "metrics": 0.1,
+    "region_DC1": 8.0,
+    "region_DC2": 2.0,
+    "region_DC4": 2.0,
+    "region_DC5": 0.1,
 }  # not pooled errors, and what only figures show
 
 
 def remake(table: str, row: Cells) -> Remake:
     """The call that makes a row again."""
+    if table.startswith("region_"):
+        return remake_region("decristoforis2020", region_run, table, row)
     seed = f"{row.get('seed', 0):.0f}"
     if table == "covariances":
-        return _scenes, (int(seed), row["place"], N_REPEATS)
+        return covariances_of, (int(seed), row["place"], N_REPEATS)
     if table == "metrics":
-        return _metrics, (int(seed), row["class"])
+        return metrics_of, (int(seed), row["class"], DEFAULT_RULES)
     study, label, function, named = _RUN_BY[table]
     given = [f"seed={seed}", *(f"{key}={row[name]:g}" for name, key in named.items())]
     if row.get("rays") == "bullet":
         given += ["simulation.physics=bullet", "simulation.rays=bullet"]
-    runs = plan_experiments([f"study=decristoforis2020/{study}", *given])
+    at = anchored("DC1") if study == "methods" else []
+    runs = plan_experiments([f"study=decristoforis2020/{study}", *at, *given])
     method = row.get(label, "icp")  # whose steps are in the table of steps
     group = [one for one in runs if one.label(label) == method]
-    origin = {"beliefs": _BELIEF, "ordering": _NOISE}.get(table)
-    return function, (group,) if origin is None else (table, origin, group)
+    return function, (table, _BELIEF, group) if table == "beliefs" else (group,)
 
 
-def _planned(study: str, n_seeds: int, *overrides: str) -> list[list[Experiment]]:
+def _planned(study: str, seeds: Sequence[int], *overrides: str) -> list[list[Experiment]]:
     """Experiments of conf/study/decristoforis2020/*.yaml, grouped by recording."""
-    seeds = f"seed=range({JUDGED_SEED},{JUDGED_SEED + n_seeds})"
-    runs = plan_experiments([f"study=decristoforis2020/{study}", seeds, *overrides])
+    given = f"seed={','.join(map(str, seeds))}"
+    runs = plan_experiments([f"study=decristoforis2020/{study}", given, *overrides])
     return group_by(runs, lambda run: run.recording_key)
 
 
@@ -235,10 +311,13 @@ def _drive(group: Sequence[Experiment]) -> Tables:
     for experiment in group:
         row, estimate = _run(experiment, recording, _RUN)
         runs.append(row)
-        if row["rate_hz"] == RATE_HZ:
-            points = map_points(recording, estimate)
-            row["map_distance_m"] = float(wall_distances_m(points, world).mean())
-            row["map_entropy"] = mean_map_entropy(points, stream(experiment.seed, "map"))
+        points = map_points(recording, estimate)
+        row["map_distance_m"] = float(wall_distances_m(points, world).mean())
+        row["map_entropy"] = mean_map_entropy(points, stream(experiment.seed, "map"))
+        if row["method"] == "odometry":
+            for name, path in _by_cause(estimate.means, truth).items():
+                points = map_points(recording, replace(estimate, means=path))
+                row[f"map_by_{name}_m"] = float(wall_distances_m(points, world).mean())
         origin = {key: row[key] for key in ("seed", "rate_hz", "rays")}
         if row["method"] == "icp":
             steps.append(origin | step_errors(recording, world, estimate))
@@ -249,6 +328,19 @@ def _drive(group: Sequence[Experiment]) -> Tables:
         }
         errors.append(pd.DataFrame(origin | off)[::every])
     return {"runs": pd.DataFrame(runs), "steps": pd.DataFrame(steps), "errors": pd.concat(errors)}
+
+
+def _by_cause(means: Array, truth: Array) -> dict[str, Array]:
+    """Paths (T, 3) whose steps have only the rotation, or only the translation, of an estimate."""
+    own, true = (se2.between(poses[:-1], poses[1:]) for poses in (means, truth))
+    steps = {
+        "rotation": np.column_stack([true[:, :2], own[:, 2]]),
+        "translation": np.column_stack([own[:, :2], true[:, 2]]),
+    }
+    return {
+        name: np.array(list(accumulate(each, se2.compose, initial=means[0])))
+        for name, each in steps.items()
+    }
 
 
 def _scored(table: str, origin: dict[str, str], group: Sequence[Experiment]) -> Tables:
@@ -319,57 +411,28 @@ def _within(path: pd.DataFrame, area: Array, margin_m: float) -> pd.DataFrame:
     return rows.groupby(rows["distance_m"] // 0.05).head(1)
 
 
-def _closeup(group: Sequence[Experiment], out: Results | None = None) -> Tables:
-    """Ellipses of registration from scan to scan along a corridor and through its bends.
-
-    With `out`, also write what the figure draws.
-    """
-    recording, world = group[0].recording(), group[0].world()
-    rows, tables = [], {}
-    for experiment in group:
-        believed = experiment.options_of("estimator")
-        scans: Scans = "last" if believed["covariance"] == "censi_last" else "both"
-        path = ellipse_path(recording, world, believed["metric"], scans, believed["neighbours"])
-        origin = {"seed": experiment.seed, "method": experiment.label("method")}
-        rows.append(origin | ellipse_summary(path))
-        if out is not None and origin["method"] == "printed":
-            out.write_arrays("corridor", walls=world.walls, wall_z_m=world.wall_z_m)
-            tables["ellipse_path"] = path.assign(seed=experiment.seed)
-    return {"ellipses": pd.DataFrame(rows), **tables}
+def _drawn_corridor(group: Sequence[Experiment], out: Results) -> Tables:
+    """What the figure draws of the first corridor: the ellipses along it."""
+    (experiment,) = (one for one in group if one.label("method") == "printed")
+    world, path = experiment.world(), _ellipses_of(experiment)
+    out.write_arrays("corridor", walls=world.walls, wall_z_m=world.wall_z_m)
+    return {"ellipse_path": path.assign(seed=experiment.seed)}
 
 
-def _scenes(seed: int, place: str, n_repeats: int) -> Tables:
-    """Many registrations of one pair of poses in a place, and all covariances of them."""
-    study, part = PLACES[place]
-    experiment = Experiment.compose([f"study=decristoforis2020/{study}", f"seed={seed}"])
-    laser = sensor_of(experiment.sensors(), "laser", Laser)
-    rng = stream(seed, f"scenes/{place}")
-    (scene,) = sample_scenes(experiment.world(), part, laser.mount.pose, rng, 1)
-    found = measure(scene, laser, rng, n_repeats, max(2, n_repeats // 4))
-    return {"covariances": found.assign(seed=seed, place=place)}
+def _closeup(group: Sequence[Experiment]) -> Tables:
+    """Ellipses of registration from scan to scan along a corridor and through its bends."""
+    rows = [
+        {"seed": one.seed, "method": one.label("method")} | ellipse_summary(_ellipses_of(one))
+        for one in group
+    ]
+    return {"ellipses": pd.DataFrame(rows)}
 
 
-def _metrics(seed: int, kind: str) -> Tables:
-    """All metrics on one of the benchmark's pairs: error and time, without an initial guess."""
-    place, size = kind.split("_")
-    p = pair(place, size, seed)
-    target, source = (prepare(r, BEARINGS_RAD) for r in (p.target_m, p.source_m))
-    rows = []
-    for metric in METRICS:
-        match = partial(register, source, target, metric=metric)
-        off = match().T_target_source - p.T_target_source
-        rows.append(
-            {
-                "seed": seed,
-                "class": kind,
-                "metric": metric,
-                "error_m": float(np.hypot(off[0], off[1])),
-                "error_rad": abs(math.remainder(off[2], 2.0 * math.pi)),
-                "time_us": 1e6 * min(timeit.repeat(match, number=1, repeat=3)),
-                "bound_m": math.sqrt(p.bound[0, 0] + p.bound[1, 1]),
-            }
-        )
-    return {"metrics": pd.DataFrame(rows)}
+def _ellipses_of(experiment: Experiment) -> pd.DataFrame:
+    believed = experiment.options_of("estimator")
+    scans: Scans = "last" if believed["covariance"] == "censi_last" else "both"
+    given = believed["metric"], scans, believed["neighbours"]
+    return ellipse_path(experiment.recording(), experiment.world(), *given)
 
 
 def _boxes(errors: pd.DataFrame) -> pd.DataFrame:
@@ -384,11 +447,9 @@ def _boxes(errors: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows)[kept]
 
 
-_AT = {"k_m": "robot.kr", "sigma_range_m": "sensors.laser.sigma_range_m"}
 _RUN_BY: dict[str, tuple[str, str, Callable[..., Tables], dict[str, str]]] = {
     "runs": ("methods", "method", _drive, {"rate_hz": _RUN["rate_hz"]}),
     "steps": ("methods", "method", _drive, {"rate_hz": _RUN["rate_hz"]}),
     "ellipses": ("corridor", "method", _closeup, {}),
     "beliefs": ("beliefs", "belief", _scored, {}),
-    "ordering": ("ordering", "method", _scored, _AT),
 }  # by table: its study, the label of its rows, what makes them, and further keys by column

@@ -11,8 +11,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from experiments.evaluation.metrics import rms
+from experiments.judging.region_runs import region_pages
 from experiments.judging.results import Arrays, Results
-from experiments.papers.gil2008.claims import pool_by_world
+from experiments.papers.gil2008.claims import HEADLINES, pool_by_world
 from experiments.papers.gil2008.settings import CELL_M
 from experiments.viewing.grid import UNKNOWN, draw_grid
 from experiments.viewing.plotting import (
@@ -75,6 +76,7 @@ def draw(results: Results) -> dict[str, Figure]:
         "gil2008_association": by_association(results.table("association")),
         "gil2008_cost": cost(results.table("cost")),
         "gil2008_settings": by_settings(results.table("resampling"), results.table("noise")),
+        **region_pages(results, HEADLINES),
     }
 
 

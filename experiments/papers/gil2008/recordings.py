@@ -80,7 +80,7 @@ def recorded(config: Config, **_scene: Any) -> Recording:
 def whole(experiment: Experiment) -> Recording:
     """Recording of an experiment's scene: all landmarks within 20 m in every image, with ids."""
     scene, camera = Scene.of(experiment), _camera(experiment)
-    driven = _drive(experiment).recording()
+    driven = drive_of(experiment).recording()
     # the images do not depend on the noise of the descriptors
     rng = stream(scene.seed, f"gil2008/images/{dataclasses.replace(scene, sigma_descriptor=0.0)}")
     world = _alike(driven.known_world, scene.alike_share, rng)
@@ -158,7 +158,7 @@ def true_ids(recording: Recording) -> NDArray[np.int64]:
     return recording.known_truth.readings["stereo"]["true_ids"]
 
 
-def _drive(experiment: Experiment) -> Experiment:
+def drive_of(experiment: Experiment) -> Experiment:
     """Drive of an experiment's robot; it does not depend on the camera."""
     camera = sensor_settings(StereoCamera(rate_hz=_camera(experiment).rate_hz))
     sensors = {**experiment.options_of("sensors"), "stereo": camera}

@@ -14,9 +14,14 @@ LABELS: dict[str, tuple[str, ...]] = {
     "resampling": ("resampling", "ess_share"),
     "noise": (),
 }
-QUICK_SEEDS = "range(1000,1002)"
+# Tables whose worlds are added until these claims are decided
+DESIGNED = {"particles": ["GI1", "GI3"], "laps": ["GI1"], "distance": ["GI4", "GI5"],
+            "association": ["GI7"]}  # fmt: skip
+N_QUICK = 2  # worlds of the quick profile
 CELL_M = 0.1  # of the occupancy grids
 N_REPEATS = {Profile.FULL: 20, Profile.QUICK: 2}  # of a run, or of the images over one drive
+REGION_ARMS = ((10, 10), (200, 3), (200, 10), (200, 20), (1000, 10))  # particles, dmax
+FEWER = {Profile.FULL: {}, Profile.QUICK: {200: 50, 1000: 100}}  # particles in their place
 N_DRAWS = {Profile.FULL: 8, Profile.QUICK: 2}  # of the wheel errors
 N_TIMINGS = {Profile.FULL: 5, Profile.QUICK: 2}
 P0 = 1e-3  # in the rows of estimators without a p0

@@ -6,19 +6,27 @@ recording.
 
 import dataclasses
 import json
-from collections.abc import Iterator, Sequence
+import operator
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from itertools import accumulate
+from typing import Any, cast
 
 import numpy as np
+import pandas as pd
 
 from estimators.odometry import Odometry
 from experiments.bench.fastslam import cost_by_landmarks
-from experiments.evaluation.metrics import position_errors_m, rms, travelled_m
+from experiments.evaluation.metrics import heading_errors_rad, position_errors_m, rms, travelled_m
+from experiments.judging.claim import Claim
 from experiments.judging.jobs import Progress, Tables, group_by, tables_of
+from experiments.judging.region_runs import region_jobs, remake_region
 from experiments.judging.remake import Cells, Remake, agrees
-from experiments.judging.results import Profile, Results
+from experiments.judging.results import FIRST_SEED, Profile, Results
+from experiments.judging.sequential import designs, run_worlds
 from experiments.papers.gil2008 import scores, settings
-from experiments.papers.gil2008.recordings import Scene, landmark_distances_m, thin, whole
+from experiments.papers.gil2008.claims import gi3, gi4, gi5, gi7, over_odometry, revisits
+from experiments.papers.gil2008.recordings import Scene, drive_of, landmark_distances_m, thin, whole
 from experiments.runs.evaluate import run_over, score_run, status_of
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Row
@@ -58,39 +66,147 @@ def run(profile: Profile, out: Results, on_progress: Progress) -> None:
     out
         Where tables and arrays go.
     """
-
-    def drawn_from(run: TableRun) -> tuple[Scene, str]:
-        return Scene.of(run[1]), json.dumps(run[1].options_of("route"))
-
-    jobs = [
-        [part[low : low + _RUNS_PER_JOB]]
-        for part in group_by(plan(profile), drawn_from)
-        for low in range(0, len(part), _RUNS_PER_JOB)
-    ]
-    tables = tables_of(rows_of, jobs, lambda share: on_progress(0.95 * share))
+    regions = region_jobs("gil2008", region_run, profile)
+    fixed = [run for run in plan(profile) if run[0] not in settings.DESIGNED]
+    calls = [*((rows_of, part) for part in _grouped(fixed)), *regions]
+    tables = tables_of(operator.call, calls, lambda share: on_progress(0.5 * share))
+    for name, claims in settings.DESIGNED.items():
+        tables |= run_worlds(
+            "gil2008", claims, profile, partial(_worlds, name, profile),
+            partial(_judged, name),
+        )  # fmt: skip
+    on_progress(0.9)
     out.write_tables(**tables, cost=cost_by_landmarks(settings.N_TIMINGS[profile]))
     write_arrays(out)
     on_progress(1.0)
 
 
+def _grouped(runs: Sequence[TableRun]) -> list[Sequence[TableRun]]:
+    """Runs over one recording together, in jobs of a like size."""
+
+    def drawn_from(run: TableRun) -> tuple[Scene, str]:
+        return Scene.of(run[1]), json.dumps(run[1].options_of("route"))
+
+    return [
+        part[low : low + _RUNS_PER_JOB]
+        for part in group_by(runs, drawn_from)
+        for low in range(0, len(part), _RUNS_PER_JOB)
+    ]
+
+
+def _worlds(name: str, profile: Profile, seeds: Sequence[int]) -> Mapping[str, pd.DataFrame]:
+    """A table's rows in more worlds; beyond the first, only of the headlines' runs."""
+    runs = list(plan_table(name, profile, seeds))
+    if seeds[0] > FIRST_SEED[profile]:
+        runs = [run for run in runs if _is_headline(run[1])]
+    return tables_of(rows_of, [[part] for part in _grouped(runs)])
+
+
+def _is_headline(run: Experiment) -> bool:
+    """Whether a run has the printed filter, or EKF-SLAM beside it, at the printed noise."""
+    camera = sensor_of(run.sensors(), "stereo", StereoCamera)
+    printed = run.options_of("estimator").get("noise_at") == "measured"
+    return printed and not camera.correlated and not camera.max_observations
+
+
+def _judged(name: str, made: Mapping[str, pd.DataFrame]) -> list[Claim]:
+    """The claims that say whether a table needs more worlds."""
+    given = designs("gil2008")
+    if name == "association":
+        return list(gi7(made[name]))
+    if name == "distance":
+        return [*gi4(made[name]), *gi5(made[name])]
+    if name == "laps":
+        return list(revisits(made[name], given["GI1"]))
+    return [*over_odometry(made[name], given["GI1"]), *gi3(made[name], None, given["GI3"])]
+
+
 def plan(profile: Profile) -> Iterator[TableRun]:
-    """All runs; the quick profile has the same ones over two worlds, with fewer repeats."""
-    n_draws, n_repeats = settings.N_DRAWS[profile], settings.N_REPEATS[profile]
+    """All runs in the first worlds; the quick profile has the same ones over two worlds."""
     for table in settings.LABELS:
-        few = profile is Profile.QUICK and table != "repeats"  # which has one world
-        for one in plan_experiments(
-            [f"study=gil2008/{table}", *few * [f"seed={settings.QUICK_SEEDS}"]]
-        ):
-            drawn = one.options_of("recording")
-            if drawn["draw"] < n_draws and drawn["image_draw"] <= n_repeats:
-                yield table, one.with_values(repeats=min(one.repeats, n_repeats))
+        yield from plan_table(table, profile)
+
+
+def plan_table(
+    table: str, profile: Profile, seeds: Sequence[int] | None = None
+) -> Iterator[TableRun]:
+    """Runs of a table; None: in the worlds that its configuration names."""
+    n_draws, n_repeats = settings.N_DRAWS[profile], settings.N_REPEATS[profile]
+    if seeds is None and profile is Profile.QUICK:
+        seeds = range(settings.N_QUICK)
+    one_world = table == "repeats" or seeds is None
+    given = [] if one_world else [f"seed={','.join(map(str, cast(Sequence[int], seeds)))}"]
+    for one in plan_experiments([f"study=gil2008/{table}", *given]):
+        drawn = one.options_of("recording")
+        if drawn["draw"] < n_draws and drawn["image_draw"] <= n_repeats:
+            yield table, one.with_values(repeats=min(one.repeats, n_repeats))
+
+
+def reference_run(values: Mapping[str, Any], seed: int) -> Row:
+    """Level of odometry, which figure 7 shows, at free settings."""
+    one = Experiment.compose(["study=gil2008", f"seed={seed}", *overrides_at(values)])
+    return {"odometry_m": _odometry(one, drive_of(one).recording())["odometry_rmse_m"]}
+
+
+def overrides_at(values: Mapping[str, Any]) -> list[str]:
+    """Overrides of the configuration at free settings: both wheels slip alike."""
+    given = [f"{name}={value}" for name, value in values.items()]
+    return [*given, *(f"robot.kl={v}" for k, v in values.items() if k == "robot.kr")]
+
+
+def region_run(name: str, values: Mapping[str, Any], seed: int, profile: Profile) -> Row:
+    """Levels of the printed filter's arms at free settings in one world."""
+    short = [] if profile is Profile.FULL else ["route.distance_m=40.0"]
+    given = [f"seed={seed}", *overrides_at(values), *short]
+    if name == "GI7":
+        return _association_levels(given, seed)
+    lines = ["study=gil2008", "estimator=fastslam_paper", *given]
+    recording = whole(Experiment.compose(lines))
+    row, fewer = _odometry(Experiment.compose(lines), recording), settings.FEWER[profile]
+    for n, far_m in settings.REGION_ARMS:
+        keys = [
+            f"estimator.n_particles={fewer.get(n, n)}",
+            f"sensors.stereo.max_distance_m={far_m}",
+        ]
+        one, label = Experiment.compose([*lines, *keys]), f"m{n}_{far_m}m"
+        row |= _levels(one, recording, label, stream(seed, "estimator/region"))
+    return row
+
+
+def _levels(one: Experiment, recording: Recording, label: str, rng: np.random.Generator) -> Row:
+    found = one_run(one, thin(recording, one), rng)
+    return {
+        f"{label}_position_m": found["revised_ate_rmse_m"],
+        f"{label}_map_m": found["map_rmse_m"],
+    }
+
+
+def _association_levels(given: Sequence[str], seed: int) -> Row:
+    """Errors by known and guessed association, and EKF-SLAM's beside."""
+    row: Row = {}
+    for label, own in {
+        "known": ["fastslam_paper", "association=known"],
+        "descriptor": ["fastslam_paper", "association=descriptor", "d0=40.0"],
+        "distance": ["fastslam_paper", "association=mahalanobis", "d0=7.81"],
+        "ekf": ["ekf_slam", "association=mahalanobis", "noise_at=measured", "d0=7.81"],
+    }.items():
+        keys = [f"estimator={own[0]}", *(f"estimator.{key}" for key in own[1:])]
+        some = [v for v in given if label != "ekf" or not v.startswith("estimator.p0")]
+        is_known = f"sensors.stereo.identifies={str(label == 'known').lower()}"
+        one = Experiment.compose(["study=gil2008/association", *keys, *some, is_known])
+        found = one_run(one, thin(whole(one), one), stream(seed, "estimator/region"))
+        row[f"{label}_m"] = found.get("revised_ate_rmse_m", found["ate_rmse_m"])
+    return row
 
 
 REMADE = dict.fromkeys(settings.LABELS, 2.7)  # not the times of `cost`
+REMADE |= {"region_GI1": 20.0, "region_GI7": 10.0}
 
 
 def remake(table: str, row: Cells) -> Remake | None:
     """The call that makes a row again; None if no run is like it."""
+    if table.startswith("region_"):
+        return remake_region("gil2008", region_run, table, row)
     for one in plan_experiments([f"study=gil2008/{table}", f"seed={row['seed']:.0f}"]):
         camera = sensor_of(one.sensors(), "stereo", StereoCamera)
         shown = {"n_seen": camera.max_observations, "rule": camera.selection}
@@ -104,14 +220,9 @@ def rows_of(runs: Sequence[TableRun], repeat: int | None = None) -> Tables:
     """Rows of every run over one recording, by table; those of one repeat, if one is given."""
     first = runs[0][1]
     scene, recording = Scene.of(first), whole(first)
-    truth, robot = recording.truth_at(recording.frame_stamps), first.robot()
-    prior = first.prior(recording)
-    rng = stream(0, "odometry")
-    odometry, _ = run_over(recording, Odometry(kr=robot.kr, kl=robot.kl), prior, rng)
     common: Row = {
         **dataclasses.asdict(scene),
-        "odometry_rmse_m": rms(position_errors_m(truth, odometry.means)),
-        "odometry_revisit_ratio": scores.revisit_ratio(truth, odometry.means),
+        **_odometry(first, recording),
         "matching_precision": scores.matching_precision(recording),
     }
     rows: dict[str, list[Row]] = {}
@@ -125,6 +236,18 @@ def rows_of(runs: Sequence[TableRun], repeat: int | None = None) -> Tables:
             row = {**shown, "repeat": number, **one_run(experiment, seen, rng)}
             rows.setdefault(table, []).append(row)
     return rows
+
+
+def _odometry(experiment: Experiment, recording: Recording) -> Row:
+    """Errors of dead reckoning over a recording."""
+    truth, robot = recording.truth_at(recording.frame_stamps), experiment.robot()
+    prior, rng = experiment.prior(recording), stream(0, "odometry")
+    odometry, _ = run_over(recording, Odometry(kr=robot.kr, kl=robot.kl), prior, rng)
+    return {
+        "odometry_rmse_m": rms(position_errors_m(truth, odometry.means)),
+        "odometry_heading_rmse_rad": rms(heading_errors_rad(truth, odometry.means)),
+        "odometry_revisit_ratio": scores.revisit_ratio(truth, odometry.means),
+    }
 
 
 def labels_of(table: str, experiment: Experiment) -> Row:

@@ -1,20 +1,17 @@
 """The figures of maximo2024, from its tables and arrays."""
 
-import textwrap
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
-from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
-from matplotlib.patches import Patch
 
 from estimators.topological import descriptors as describers
-from experiments.judging.claim import Verdict
+from experiments.judging.region_runs import region_pages
 from experiments.judging.results import Arrays, Results
-from experiments.papers.maximo2024.claims import COMPARISONS, geometries, headlines, judged_map
+from experiments.papers.maximo2024.claims import HEADLINES, geometries, headlines
 from experiments.papers.maximo2024.settings import (
     CONTROLS,
     DRAWN_DESCRIPTOR,
@@ -36,17 +33,7 @@ from experiments.viewing.style import BLACK, BLUE, CYCLE, GREEN, ORANGE, RED, SK
 
 _COLOUR = {"M1": ORANGE, "M2": BLUE, "M3": GREEN}
 _FLOOR_M = {"oxford": 1.0, "umh": 0.03, "campus": 0.1}
-_VERDICT = {
-    Verdict.REPRODUCED: "#9BD0A5",
-    Verdict.UNDECIDED: "#DDDDDD",
-    Verdict.NOT_REPRODUCED: "#F2B48C",
-}
 _DESCRIPTORS = {"scan_context": "Scan Context", "ring_key": "ring key", "m2dp": "M2DP"}
-_COMPARED = {  # what a comparison of weightings is about, by its quantity
-    "error": "error of {0.method} over {0.over}",
-    "failures": "share of worlds with {0.method} worse than 5 times {0.over}",
-    "dispersion": "dispersion of {0.method} over {0.over} at step 10",
-}
 _RECALL = {"recall_at_1": "recall@1", "recall_at_1_percent": "recall@1 %"}
 
 
@@ -66,7 +53,7 @@ def draw(results: Results) -> dict[str, Figure]:
             _without_controls(results.table("table_1")), results.table("weighting")
         ),
         "maximo2024_table_2": table_2(results.table("table_2")),
-        "maximo2024_quality": quality(results.table("quality")),
+        **region_pages(results, HEADLINES),
         "maximo2024_kidnapping": kidnapping(results.table("kidnapping")),
         "maximo2024_campus": campus_errors(
             results.table("campus_starts"), results.table("clusters")
@@ -215,41 +202,6 @@ def table_2(table: pd.DataFrame) -> Figure:
     columns[0][0][0].set(ylabel="mean error, m")
     columns[0][0][1].set(ylabel="time a node, ms")
     return with_legend(page, ncols=2)
-
-
-def quality(table: pd.DataFrame) -> Figure:
-    """Each comparison of weightings and its verdict, by the descriptors' noise and B."""
-    names = geometries(table)
-    page, axes = subplots(11.5, 3.0 * len(names) + 0.6, len(names), len(COMPARISONS), squeeze=False)
-    for row, name in zip(axes, names, strict=True):
-        recall = table[table["geometry"] == name].groupby("noise_weight")["recall_at_1"].mean()
-        for ax, compare in zip(row, COMPARISONS, strict=True):
-            cells = judged_map(table, name, compare)
-            verdicts, values = (
-                cells.pivot_table(
-                    index="noise_weight", columns="n_nearest", values=v, aggfunc="first"
-                )
-                for v in ("verdict", "value")
-            )
-            colours = verdicts.map(lambda verdict: to_rgb(_VERDICT[verdict])).to_numpy()
-            ax.imshow(np.array([list(line) for line in colours]), aspect="auto", origin="lower")
-            for (i, j), value in np.ndenumerate(values):
-                ax.text(j, i, f"{value:.2f}", ha="center", va="center", fontsize=8)
-            ax.set(
-                xlabel="neighbours (B)",
-                xticks=range(values.shape[1]),
-                xticklabels=values.columns,
-                yticks=range(len(values)),
-                yticklabels=[f"{w:g} ({recall[w]:.2f})" for w in values.index],
-            )
-            about = cells["about"].iloc[0]
-            label = f"{_COMPARED[about.quantity].format(about)}, {about.place}"
-            ax.set_title(textwrap.fill(label, 30), fontsize=9)
-            ax.spines[:].set_visible(False)
-        row[0].set(ylabel="noise weight (recall@1)")
-    handles = [Patch(color=colour, label=v.label) for v, colour in _VERDICT.items()]
-    page.legend(handles=handles, loc="outside lower center", ncols=3)
-    return page
 
 
 def oxford_runs(table: pd.DataFrame) -> Figure:

@@ -7,24 +7,19 @@ from experiments.runs.paths import SOURCE
 POSITIONS = SOURCE.parent / "shared" / "data" / "oxford_positions" / "positions.csv.gz"
 # Geometries of the tables, the paper's first; controls have their queries off the route
 NAMES = {
-    "oxford": "Oxford, made route",
-    "oxford_real": "Oxford, real positions",
-    "umh": "UMH",
+    "oxford": "Oxford's route as printed",
+    "oxford_real": "Oxford's real positions",
+    "umh": "UMH's route as printed",
     "campus": "campus clouds",
-    "oxford_plane": "Oxford, plane offsets",
-    "umh_plane": "UMH, plane offsets",
+    "oxford_plane": "Oxford's route, plane offsets",
+    "umh_plane": "UMH's route, plane offsets",
 }
+# The free settings that are shared by both data sets, as the findings name them
+SIGMA_L, SIGMA_M, B = "sigma_l, node spacings", "estimator.sigma_m", "estimator.n_nearest"
+PLACES = {"oxford": "Oxford", "oxford_real": "Oxford", "umh": "UMH"}  # of the printed levels
 CONTROLS = ("oxford_plane", "umh_plane")
-JUDGED_SEED = 1000  # seeds 0-99 are for tuning
 
-N_WORLDS = {Profile.FULL: 24, Profile.QUICK: 2}  # of each route
-# Worlds in which the weightings are compared on the paper's two data sets. On 12 tuning worlds
-# (seeds 20-31, 10 repeats) the dispersion of M2 over M1 on Oxford has a mean log of -0.051 and a
-# deviation of 0.079: of 60 worlds Wilcoxon's p is below 0.01 with a power of 99 %. M2's error over
-# M1's is 1.00 there (0.82 to 1.23), and no affordable number would settle that; that M3 is worse
-# than 5 times M2 is settled by far fewer (in none of 12).
-N_WEIGHTED = {Profile.FULL: 60, Profile.QUICK: 2}
-N_QUALITY_WORLDS = {Profile.FULL: 20, Profile.QUICK: 2}
+N_WORLDS = {Profile.FULL: 20, Profile.QUICK: 2}  # of each route; of the weightings, by design
 N_RUN_SEEDS = {Profile.FULL: 3, Profile.QUICK: 1}  # worlds of each of the fifteen Oxford runs
 N_CAMPUSES = {Profile.FULL: 20, Profile.QUICK: 1}
 N_CLUSTERED_CAMPUSES = 5
@@ -35,17 +30,9 @@ N_REPEATS = {Profile.FULL: 10, Profile.QUICK: 2}  # in each world
 N_STARTS = {Profile.FULL: 20, Profile.QUICK: 10}
 
 METHODS = ("M1", "M2", "M3")
-# sigma_l in node spacings, sigma_m, B of all methods: M2's least mean error, by `study.tune`
-TUNED = {"oxford": (4.0, 0.1, 2), "oxford_real": (4.0, 0.05, 2), "umh": (4.0, 0.4, 2)}
-GRID_SIGMA_L = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
-GRID_SIGMA_M = (0.05, 0.1, 0.2, 0.4)
-GRID_B = (2, 3, 5, 10, 20)  # at B = 1 the three weightings are the same filter
 PER_NODE = (2, 4, 6, 8)  # particles, table 2
-# The map over descriptor quality, with the sigmas of `TUNED`
-QUALITIES = (0.4, 0.8, 1.2, 1.6)
-JUDGED_QUALITY = 0.8  # of all else
-QUALITY_STEPS = 136
-
+LEAST_M = 1e-3  # added to dispersions that may be zero, before a logarithm
+QUICK_STEPS = 136  # of a region's runs in the quick profile
 TOLERANCE = 1.5  # spacings: an estimate within is right
 HELD = 10  # steps that it has to stay right
 WITHIN = 40  # steps to localize in

@@ -1,13 +1,13 @@
 """The study of maximo2024: weightings M1-M3, particles, starts, kidnapping, clouds of a campus.
 
 The route is the unit of inference. Each world is a route, or the real Oxford positions, with
-queries and descriptors of its own. Parameters are chosen on seeds below 100 by `tune`, and judged
-on seeds from 1000 on.
+queries and descriptors of its own. Parameters are those of the anchor (findings.yaml, `regions`).
 """
 
-import itertools
 import math
-from collections.abc import Iterable
+import operator
+from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
 
 import numpy as np
 import pandas as pd
@@ -16,28 +16,23 @@ from numpy.typing import NDArray
 from estimators.topological.topological_map import from_recording
 from experiments.bench import topological
 from experiments.judging.jobs import Progress, Tables, tables_of
+from experiments.judging.region_runs import region_jobs, remake_region
 from experiments.judging.remake import Cells, Remake
-from experiments.judging.results import Arrays, Profile, Results
-from experiments.papers.maximo2024.claims import headlines
+from experiments.judging.results import FIRST_SEED, Arrays, Profile, Results
+from experiments.judging.sequential import run_worlds
+from experiments.papers.maximo2024.claims import headlines, mx1, mx3, mx7
 from experiments.papers.maximo2024.places import oxford_runs, resequence
 from experiments.papers.maximo2024.settings import (
     CONTROLS,
     DRAWN_DESCRIPTOR,
-    GRID_B,
-    GRID_SIGMA_L,
-    GRID_SIGMA_M,
     HELD,
     ITERATIONS,
-    JUDGED_SEED,
     METHODS,
-    N_CAMPUSES,
     N_CLUSTERED_CAMPUSES,
-    N_QUALITY_WORLDS,
     N_REPEATS,
     N_RUN_SEEDS,
     N_STARTS,
     N_TIMINGS,
-    N_WEIGHTED,
     N_WORLDS,
     POSITIONS,
     PRINTED_1,
@@ -58,8 +53,10 @@ from experiments.papers.maximo2024.worlds import (
     make_case,
     options,
     particle_rows,
-    quality_rows,
+    reference_run,  # noqa: F401 - for judging.anchors
+    region_run,
     run_rows,
+    start_errors,
     starts,
     weighting_rows,
 )
@@ -70,7 +67,6 @@ from sim.arrays import Array
 from sim.recording import Recording
 from sim.sensors import Lidar3D
 
-_TUNED_BY = ("geometry", "sigma_l", "sigma_m", "n_nearest")
 _REACH_M = 65.0  # of the clouds kept, from the middle of the nodes drawn
 _CLOUD_GRID_M = 0.05
 
@@ -86,35 +82,61 @@ def run(profile: Profile, out: Results, on_progress: Progress) -> None:
         Where tables and arrays go.
     """
     jobs, costs = zip(*_jobs(profile), strict=True)
-    tables = tables_of(_labelled, jobs, on_progress, costs)
-    tables["times"] = times(N_TIMINGS[profile])
+    regions = region_jobs("maximo2024", region_run, profile)
+    calls = [(_labelled, *job) for job in jobs] + regions
+    each = [*costs, *(len(regions) * [1.0])]
+    tables = tables_of(operator.call, calls, lambda share: on_progress(0.6 * share), each)
+    decisive = sorted(headlines(routes()))
+    tables |= _joined(tables, run_worlds(
+        "maximo2024", ["MX1", "MX3"], profile, partial(_block, "weighting", decisive, profile),
+        lambda made: [*mx1(made["weighting"]), *mx3(made["dispersion"])],
+    ))  # fmt: skip
+    tables |= _joined(tables, run_worlds(
+        "maximo2024", ["MX7"], profile, partial(_block, "campus", ["campus"], profile),
+        lambda made: [mx7(made["campus_starts"])],
+    ))  # fmt: skip
+    first = FIRST_SEED[profile]
+    tables["times"] = times(N_TIMINGS[profile], first)
     tables["table_1"] = table_1(tables["weighting"])
     tables["table_2"] = table_2(tables["particles"], tables["times"])
-    drawn = {
-        name: route_arrays(make_case(name, JUDGED_SEED), N_REPEATS[profile]) for name in routes()
-    }
+    drawn = {name: route_arrays(make_case(name, first), N_REPEATS[profile]) for name in routes()}
     tables["figure_5"] = figure_5(drawn)
     out.write_tables(**tables)
     for name, arrays in drawn.items():
         out.write_arrays(name, **arrays)
-    out.write_arrays("campus", **campus_arrays())
+    out.write_arrays("campus", **campus_arrays(first))
 
 
 Job = tuple[str, str, int, Profile]  # what to run, in which world
 
 
+def _block(
+    what: str, names: Sequence[str], profile: Profile, seeds: Sequence[int]
+) -> Mapping[str, pd.DataFrame]:
+    """Tables of worlds that are added until their claims are decided."""
+    jobs = [(what, name, seed, profile) for seed in seeds for name in names]
+    return tables_of(_labelled, jobs)
+
+
+def _joined(
+    first: Mapping[str, pd.DataFrame], second: Mapping[str, pd.DataFrame]
+) -> dict[str, pd.DataFrame]:
+    """Tables of both, those of the same name joined."""
+    return {
+        name: pd.concat([first[name], table], ignore_index=True) if name in first else table
+        for name, table in second.items()
+    }
+
+
 def _jobs(profile: Profile) -> list[tuple[Job, float]]:
-    """All jobs and how long they take, the longest first."""
-    decisive = sorted(headlines(routes()))
+    """Jobs of all worlds whose number is fixed, and how long they take, the longest first."""
+    others = [*CONTROLS, *sorted(set(routes()) - headlines(routes()))]
     return [
-        ((what, name, JUDGED_SEED + i, profile), cost)
+        ((what, name, FIRST_SEED[profile] + i, profile), cost)
         for what, (names, n, cost) in {
-            "campus": (["campus"], N_CAMPUSES, 10.0),
             "runs": (["oxford_runs"] * POSITIONS.is_file(), N_RUN_SEEDS, 10.0),
             "route": (routes(), N_WORLDS, 6.0),
-            "weighting": (decisive, N_WEIGHTED, 3.0),
-            "control": ([*CONTROLS, *(set(routes()) - set(decisive))], N_WORLDS, 3.0),
-            "quality": (decisive, N_QUALITY_WORLDS, 3.0),
+            "weighting": (others, N_WORLDS, 3.0),
         }.items()
         for i in range(n[profile])
         for name in names
@@ -127,21 +149,25 @@ REMADE = {
     "dispersion": 4.0,
     "kidnapping": 1.5,
     "particles": 4.0,
-    "quality": 3.0,
     "runs": 15.0,
     "starts": 1.0,
     "weighting": 4.0,
+    "region_MX1": 15.0,
 }  # not means and times
 
 
 def are_here(table: pd.DataFrame) -> NDArray[np.bool_]:
     """Which rows can be made here: those of the real positions only with them."""
+    if "geometry" not in table:
+        return np.full(len(table), POSITIONS.is_file())
     real = table["geometry"].isin(("oxford_real", "oxford_runs"))
     return np.asarray(~real | POSITIONS.is_file())
 
 
 def remake(table: str, row: Cells) -> Remake:
     """The call that makes a row again."""
+    if table.startswith("region_"):
+        return remake_region("maximo2024", region_run, table, row)
     name = row["geometry"]
     of_route = dict.fromkeys(("starts", "kidnapping", "clusters", "particles"), "route")
     what = {**of_route, "dispersion": "weighting"}.get(table, table)
@@ -176,14 +202,13 @@ def _rows(
     """All rows of a job, by table."""
     n_repeats = N_REPEATS[profile]
     if what == "campus":
-        return campus_rows(seed, profile, with_clusters=seed < JUDGED_SEED + N_CLUSTERED_CAMPUSES)
-    if what == "quality":
-        return {"quality": list(quality_rows(name, seed))}
+        is_early = seed < FIRST_SEED[profile] + N_CLUSTERED_CAMPUSES
+        return campus_rows(seed, profile, with_clusters=is_early)
     if what == "runs":
         names, n_fewer = oxford_runs(POSITIONS), max(n_repeats // 5, 1)
         return {"runs": [{"run": n, **row} for n in names for row in run_rows(n, seed, n_fewer)]}
     case = make_case(name, seed)
-    if what in ("weighting", "control"):
+    if what == "weighting":
         return weighting_rows(case, n_repeats, METHODS if method is None else (method,))
     settings, tolerance_m = options(case), TOLERANCE * case.known_map.spacing_m
     by_mode = settings | {"estimate": "mode"}
@@ -195,15 +220,16 @@ def _rows(
         "kidnapping": kidnapping_rows(case, by_mode, 0.05, 5, RECOVERED_WITHIN + HELD),
         "clusters": map(cluster_row, [case.known_map], [case.recording], ["synthetic"], [seed]),
         "particles": particle_rows(case, n_repeats),
+        "start_errors": [start_errors(case, settings)],
     }
     return {table: list(rows) for table, rows in found.items() if only in (None, table)}
 
 
-def times(n_repeats: int) -> pd.DataFrame:
+def times(n_repeats: int, seed: int) -> pd.DataFrame:
     """Table 2: time per node on one core, timed repeatedly after the other jobs have ended."""
     rows = []
     for name in sorted(headlines(routes())):
-        experiment = make_case(name, JUDGED_SEED).experiment
+        experiment = make_case(name, seed).experiment
         for count, paper_s in topological.PAPER_S[name.removesuffix("_real")].items():
             found = [topological.node_s(experiment, count) for _ in range(n_repeats)]
             rows += [(name, count, repeat, time_s, paper_s) for repeat, time_s in enumerate(found)]
@@ -291,7 +317,7 @@ def route_arrays(case: Case, n_repeats: int) -> Arrays:
     }
 
 
-def campus_arrays() -> Arrays:
+def campus_arrays(seed: int) -> Arrays:
     """Nodes, their clusters, queries and walls; clouds of four nodes and of four queries.
 
     Returns
@@ -301,7 +327,7 @@ def campus_arrays() -> Arrays:
         clouds were taken, `map_spots_m` and `query_spots_m` (4, 2), and what they show above
         ground, `map_clouds_m` and `query_clouds_m` (P, 2).
     """
-    experiments = campus_runs(JUDGED_SEED)
+    experiments = campus_runs(seed)
     mapping, taking = (experiment.recording() for experiment in experiments)
     spacing_m = experiments[0].options_of("prior.map")["spacing_m"]
     known = from_recording(mapping, DRAWN_DESCRIPTOR, spacing_m)
@@ -313,7 +339,7 @@ def campus_arrays() -> Arrays:
     query_spots, query_clouds = _clouds(taking, between)
     return {
         "nodes_m": known.positions_m,
-        "clusters": cluster_labels(known, JUDGED_SEED),
+        "clusters": cluster_labels(known, seed),
         "queries_m": taking.truth_at(taking.frame_stamps)[:, :2],
         "walls_m": taking.known_world.walls.reshape(-1, 2, 2),
         "map_spots_m": map_spots,
@@ -337,30 +363,6 @@ def _clouds(recording: Recording, points_m: Array) -> tuple[Array, NDArray[np.fl
     drawn = drawn[np.hypot(*(drawn - points_m.mean(axis=0)).T) < _REACH_M]
     cells = np.unique(np.round(drawn / _CLOUD_GRID_M), axis=0)  # finer than a picture shows
     return poses[rows, :2], (_CLOUD_GRID_M * cells).astype(np.float32)
-
-
-# Choosing the parameters
-
-
-def tune(out: Results, n_worlds: int = 8) -> None:
-    """Mean error of M2 at every setting of the grid on seeds 0, 1, ...; the least is in `TUNED`.
-
-    Takes about ten minutes on two cores. The settings see the same worlds and draws.
-    """
-    jobs = [(name, seed) for seed in range(n_worlds) for name in routes()]
-    table = tables_of(_tuning_rows, jobs)["tuning"]
-    by = table.groupby(list(_TUNED_BY), as_index=False, sort=False)
-    out.write_tables(tuning=by["error_m"].mean())
-
-
-def _tuning_rows(name: str, seed: int) -> Tables:
-    case, rows = make_case(name, seed), []
-    for sigma_l, sigma_m, n_nearest in itertools.product(GRID_SIGMA_L, GRID_SIGMA_M, GRID_B):
-        settings = options(case, "M2", (sigma_l, sigma_m, n_nearest))
-        walk = localize(case, settings, stream(seed, "estimator/tuning"))
-        setting = dict(zip(_TUNED_BY, (name, sigma_l, sigma_m, n_nearest), strict=True))
-        rows.append({**setting, "error_m": float(walk.errors_m.mean())})
-    return {"tuning": rows}
 
 
 def routes() -> list[str]:

@@ -3,11 +3,10 @@
 A world is a route with a synthetic field of descriptors, or a campus with simulated clouds.
 """
 
-import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +16,7 @@ from estimators.base import Estimate, Prior
 from estimators.topological import descriptors as describers
 from estimators.topological.topological_map import TopologicalMap, from_recording
 from experiments.evaluation.metrics import position_errors_m, rms, travelled_m
+from experiments.judging.free_settings import Anchor, free_settings
 from experiments.judging.results import Profile
 from experiments.papers.maximo2024.places import (
     N_STRETCHES,
@@ -27,27 +27,30 @@ from experiments.papers.maximo2024.places import (
 )
 from experiments.papers.maximo2024.settings import (
     CAMPUS_SHIFT_M,
-    GRID_B,
     HELD,
     KIDNAPPED_AFTER,
+    LEAST_M,
     METHODS,
     N_CAMPUS_STARTS,
     N_KIDNAPPINGS,
     N_REPEATS,
     PER_NODE,
+    PLACES,
     POSITIONS,
-    QUALITIES,
-    QUALITY_STEPS,
+    QUICK_STEPS,
     RECOVERED_WITHIN,
+    SIGMA_L,
+    SIGMA_M,
     TOLERANCE,
-    TUNED,
     WITHIN,
+    B,
 )
 from experiments.runs.evaluate import run_over
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Row
 from experiments.runs.seeds import stream
 from sim.arrays import Array
+from sim.errors import require
 from sim.recording import Recording
 
 Rows = list[Row]
@@ -73,9 +76,14 @@ class Case:
 
 
 def make_case(name: str, seed: int, *overrides: str) -> Case:
-    """World of a route; `oxford_real` has the real positions, `_plane` queries off the route."""
+    """World of a route; `oxford_real` has the real positions, `_plane` queries off the route.
+
+    The noise of its descriptors is that of the anchor, unless `overrides` has another.
+    """
     route, _, kind = name.partition("_")
-    lines = [f"study=maximo2024/{route}", f"seed={seed}", *overrides]
+    noise = anchored(name)["recording.noise_weight"]
+    lines = [f"study=maximo2024/{route}", f"seed={seed}", f"recording.noise_weight={noise}"]
+    lines += overrides
     if kind == "real":
         lines.append(f"positions='{POSITIONS}'")
     if kind == "plane":
@@ -88,7 +96,7 @@ def make_case(name: str, seed: int, *overrides: str) -> Case:
 def options(
     case: Case, method: str = "M2", parameters: tuple[float, float, int] | None = None
 ) -> dict[str, Any]:
-    """Keys of the estimator: a method, with the parameters chosen for the geometry or others.
+    """Keys of the estimator: a method, with the parameters of the geometry's anchor or others.
 
     The campus takes those of UMH, untuned, in units of its own spacing.
 
@@ -97,14 +105,21 @@ def options(
     parameters
         sigma_l in node spacings, sigma_m, B.
     """
-    own = case.name.removesuffix("_plane")
-    sigma_l, sigma_m, n_nearest = parameters or TUNED[own if own in TUNED else "umh"]
+    sigma_l, sigma_m, n_nearest = parameters or _parameters(anchored(case.name))
     return {
         "weighting": method,
         "sigma_l_m": sigma_l * case.known_map.spacing_m,
         "sigma_m": sigma_m,
         "n_nearest": n_nearest,
     }
+
+
+def anchored(name: str) -> Mapping[str, Any]:
+    """The free settings at the anchor of a geometry; of a campus, UMH's."""
+    place = PLACES.get(name.removesuffix("_plane"), "UMH")
+    at = free_settings("maximo2024")["MX1"].printed[place].anchor
+    require(at is not None, f"maximo2024/findings.yaml: MX1 has no anchor on {place}")
+    return cast(Anchor, at).settings
 
 
 @dataclass(frozen=True)
@@ -259,23 +274,60 @@ def kidnapping_rows(
             }
 
 
-def quality_rows(name: str, seed: int) -> Iterator[Row]:
-    """Map of M1-M3 over the descriptors' noise and B, all else as in `weighting_rows`."""
-    for noise in QUALITIES:
-        case = make_case(name, seed, f"recording.noise_weight={noise}")
-        recall = _retrieval(case.known_map, case.recording)["recall_at_1"]
-        part = case.recording.cut(QUALITY_STEPS)
-        for n_nearest, method in itertools.product(GRID_B, METHODS):
-            settings = options(case, method) | {"n_nearest": n_nearest}
-            walk = localize(case, settings, stream(seed, "estimator/quality"), part)
-            yield {
-                "noise_weight": noise,
-                "recall_at_1": recall,
-                "n_nearest": n_nearest,
-                "method": method,
-                "error_m": float(walk.errors_m.mean()),
-                "dispersion_m": float(walk.dispersions_m[10]),
-            }
+def reference_run(values: Mapping[str, Any], seed: int) -> Row:
+    """Level of M2, which the paper prints, on both routes at free settings."""
+    found: Row = {}
+    for place, case in _cases_at(values, seed, Profile.FULL):
+        settings = options(case, "M2", _parameters(values))
+        walk = localize(case, settings, stream(seed, "estimator/region"))
+        found[f"{place}_m2_m"] = float(walk.errors_m.mean())
+    return found
+
+
+def _cases_at(values: Mapping[str, Any], seed: int, profile: Profile) -> Iterator[tuple[str, Case]]:
+    """World of each route at free settings."""
+    given = [f"{key}={value}" for key, value in values.items() if key.startswith("recording.")]
+    for place, name in (
+        ("oxford", "oxford_real" if POSITIONS.is_file() else "oxford"),
+        ("umh",) * 2,
+    ):
+        case = make_case(name, seed, *given)
+        is_quick = profile is Profile.QUICK
+        part = case.recording.cut(QUICK_STEPS) if is_quick else case.recording
+        yield place, replace(case, recording=part)
+
+
+def _parameters(values: Mapping[str, Any]) -> tuple[float, float, int]:
+    return float(values[SIGMA_L]), float(values[SIGMA_M]), int(values[B])
+
+
+def region_run(_name: str, values: Mapping[str, Any], seed: int, profile: Profile) -> Row:
+    """Levels of all methods on both routes at free settings: errors, dispersions, starts."""
+    row: Row = {}
+    for place, case in _cases_at(values, seed, profile):
+        for method in METHODS:
+            settings = options(case, method, _parameters(values))
+            walk = localize(case, settings, stream(seed, "estimator/region"))
+            row[f"{place}_{method.lower()}_m"] = float(walk.errors_m.mean())
+            row[f"{place}_{method.lower()}_dispersion_m"] = float(walk.dispersions_m[10]) + LEAST_M
+        row[f"{place}_nearest_m"] = _nearest_node_m(case)
+        by_m2 = options(case, "M2", _parameters(values))
+        for per_node in (min(PER_NODE), max(PER_NODE)):
+            settings = by_m2 | {"particles_per_node": per_node}
+            walk = localize(case, settings, stream(seed, f"estimator/region/{per_node}"))
+            row[f"{place}_m2_{per_node}_m"] = float(walk.errors_m.mean())
+        row |= {f"{place}_{key}": value for key, value in start_errors(case, by_m2).items()}
+    return row
+
+
+def start_errors(case: Case, settings: dict[str, Any]) -> Row:
+    """Least and greatest of the mean errors from the three starts of figure 5, m."""
+    n, errors = len(case.recording.frame_stamps), []
+    for start in (0, n // 4, n // 2):
+        part = resequence(case.recording, np.arange(start, n)) if start else case.recording
+        walk = localize(case, settings, stream(case.seed, "estimator/from", start), part)
+        errors.append(float(walk.errors_m.mean()))
+    return {"least_start_m": min(errors), "most_start_m": max(errors)}
 
 
 def _retrieval(known_map: TopologicalMap, recording: Recording) -> dict[str, float]:

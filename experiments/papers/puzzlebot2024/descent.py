@@ -2,13 +2,19 @@
 
 import itertools
 import math
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
 
-from experiments.papers.puzzlebot2024.settings import DESCENTS
+from experiments.papers.puzzlebot2024.settings import DESCENTS, N_CASES, REPORTS
+from experiments.runs.row import Row
+from experiments.runs.seeds import stream
 from sim.arrays import Array
+from sim.robot.drive import DifferentialDrive
+from sim.robot.kinematic import run_batch
+from sim.routes.route import OpenLoop
 
 
 def report_gradient_descent(
@@ -72,3 +78,26 @@ def convergence() -> pd.DataFrame:
         columns = {"data": name, "iteration": np.arange(len(k)), "k": k, "error": error}
         parts.append(pd.DataFrame(columns))
     return pd.concat(parts, ignore_index=True)
+
+
+def from_nine_runs(
+    robot: DifferentialDrive, routes: Mapping[str, OpenLoop], seed: int
+) -> Iterator[Row]:
+    """Kl from the straights and kr from the turns of table 1, each driven once, by the report.
+
+    Its descent is stated at its limit, which a faster rate reaches in a few steps; after the 100
+    iterations of the report it is still between that and its start, 1.
+    """
+    rng = stream(seed, "slip")
+    for parameter, axis in (("kl", 0), ("kr", 2)):
+        slips = []
+        for route in routes.values():
+            _, omega, duration_s = route.segments[0]
+            end = run_batch(robot, route, 1, rng).end_poses[0]
+            if (omega != 0.0) == (parameter == "kr"):
+                slips.append((end[axis] - route.ideal_end()[axis]) / duration_s)
+        rate = 1.0 / (16.0 * float(np.mean(np.square(slips))))
+        limit = float(report_gradient_descent(0.0, slips, 1.0, rate=rate)[-1])
+        found = {"value": limit, "low": limit, "high": limit}
+        truth = {"parameter": parameter, "truth": getattr(robot, parameter)}
+        yield {"runs": N_CASES, "method": REPORTS, **truth, **found}

@@ -12,6 +12,9 @@ COVERAGE_RUNS = {Profile.QUICK: 400, Profile.FULL: 10_000}
 CLOSE_K_M = 1e-5  # the coverage is close to its bound: ten times the runs
 FEW_SEEDS = {Profile.QUICK: ["seed=range(1000,1004)"], Profile.FULL: []}  # of driven robots
 CALIBRATION_RUNS = 20  # repetitions of each of the nine manoeuvres in one calibration
+FEW_RUNS = 2  # the least from which the scatter of end poses can be told
+N_CASES = 9  # of table 1, which the report drives once each
+REPORTS = "the report's program"  # as a method of calibration
 SQUARE_RUNS = 40
 SQUARE_SAMPLES = 200  # of each path that is drawn
 TABLE_1_K_M = 1e-4

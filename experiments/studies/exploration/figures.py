@@ -6,7 +6,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from experiments.judging.results import Results
-from experiments.studies.exploration.settings import AFTER_M, BASE, JUDGED, NAMES
+from experiments.studies.exploration.settings import AFTER_M, BASE, BOTH, NAMES
 from experiments.viewing.plotting import draw_band, with_legend
 from experiments.viewing.style import BLACK, BLUE, GREEN, ORANGE, PURPLE, RED, WALL, subplots
 from experiments.viewing.team_figure import draw_paths
@@ -24,7 +24,7 @@ def draw(results: Results) -> dict[str, Figure]:
     """Draw every figure, by file name."""
     return {
         "exploration_drive": drives(
-            {name: results.arrays(f"drive_{name}") for name in (BASE, JUDGED)}
+            {name: results.arrays(f"drive_{name}") for name in (BASE, BOTH)}
         ),
         "exploration_coverage": by_distance(results.table("coverage")),
     }

@@ -1,18 +1,15 @@
 """Constants of the study of exploration; the configuration is in conf/study/exploration.yaml."""
 
-from experiments.judging.results import Profile
-
-BASE, JUDGED = "nearest_frontier", "coordinated"
-SHARED, GAIN = "shared_frontiers", "information_gain"  # each with one half of what is judged
+# Coordination is to share the frontiers out; the information gain and both together stand beside
+BASE, JUDGED = "nearest_frontier", "shared_frontiers"
+BOTH, GAIN = "coordinated", "information_gain"
 NAMES = {  # of the strategies, in words
     "random": "random",
     BASE: "nearest frontier",
-    SHARED: "shared out by cost",
+    JUDGED: "shared out by cost",
     GAIN: "information gain",
-    JUDGED: "coordinated",
+    BOTH: "shared out and weighed by gain",
 }
-FIRST_SEED = 1000  # of the judged worlds
-WORLDS = {Profile.FULL: 30, Profile.QUICK: 2}
 AFTER_M = 15.0  # driven a robot, after which the area is judged
 RESOLUTION_M = 0.2  # of the area
 N_ROBOTS = 3

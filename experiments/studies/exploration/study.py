@@ -6,6 +6,8 @@ the truth: floor that a beam has crossed, from where the robots were.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+
 import numpy as np
 import pandas as pd
 
@@ -14,11 +16,13 @@ from experiments.evaluation.map_quality import landmark_errors
 from experiments.evaluation.metrics import travelled_m
 from experiments.judging.jobs import Progress, Tables, tables_of
 from experiments.judging.remake import Cells, Remake
-from experiments.judging.results import Profile, Results
+from experiments.judging.results import FIRST_SEED, Profile, Results
+from experiments.judging.sequential import run_worlds
 from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Row
 from experiments.studies.exploration import settings
+from experiments.studies.exploration.claims import gi10
 from experiments.viewing.team_figure import drive_of
 from sim import se2
 from sim.arrays import Array
@@ -39,15 +43,17 @@ def run(profile: Profile, out: Results, on_progress: Progress) -> None:
     profile
         `quick`: two worlds.
     """
-    jobs = [
-        (settings.FIRST_SEED + i, strategy)
-        for strategy in settings.NAMES
-        for i in range(settings.WORLDS[profile])
-    ]
-    out.write_tables(**tables_of(tables_from, jobs, on_progress))
-    for strategy in (settings.BASE, settings.JUDGED):
-        team = compose_experiment(settings.FIRST_SEED, strategy).recordings()
+    tables = run_worlds("exploration", ["GI10"], profile, _worlds, lambda t: list(gi10(t["runs"])))
+    on_progress(0.95)
+    out.write_tables(**tables)
+    for strategy in (settings.BASE, settings.BOTH):
+        team = compose_experiment(FIRST_SEED[profile], strategy).recordings()
         out.write_arrays(f"drive_{strategy}", **drive_of(team.robots, settings.AFTER_M))
+    on_progress(1.0)
+
+
+def _worlds(seeds: Sequence[int]) -> Mapping[str, pd.DataFrame]:
+    return tables_of(tables_from, [(seed, one) for one in settings.NAMES for seed in seeds])
 
 
 REMADE = {"runs": 5.0, "coverage": 5.0}

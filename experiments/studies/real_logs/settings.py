@@ -31,6 +31,7 @@ KHEPERA = {  # published: right and left diameter, axle, m
     "l90": (0.0414408, 0.0411796, 0.0880134),
     "lmov": (0.0415888, 0.0414217, 0.0883953),
 }
+HELD_OUT = "calibrated on the first half, judged on the second"
 LEGO_START_RAD = math.radians(213.0)
 
 # Names of the runs of conf/study/real_logs/*.yaml, in their order

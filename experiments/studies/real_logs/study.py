@@ -44,6 +44,7 @@ from experiments.studies.real_logs.settings import (
     FREIBURG,
     FUSION,
     GMAPPING,
+    HELD_OUT,
     INTEL,
     INTEL_DRAWN,
     KHEPERA,
@@ -323,7 +324,7 @@ def lego_errors() -> pd.DataFrame:
             rms_m(lego.EFFECTIVE_TRACK_M),
         ),
         ("calibrated", found.tick_m.value, whole.value, found.rms_m, whole.low, whole.high),
-        ("calibrated on the first half, judged on the second", tick_m, track_m, rest),
+        (HELD_OUT, tick_m, track_m, rest),
     ]
     columns = ["case", "tick_m", "track_m", "rms_m", "track_low_m", "track_high_m"]
     return pd.DataFrame(rows, columns=columns)

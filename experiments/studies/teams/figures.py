@@ -7,14 +7,20 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from experiments.evaluation.statistics import log_ratio_interval
+from experiments.judging.region_runs import region_pages
 from experiments.judging.results import Results
-from experiments.studies.teams.claims import NAMES
-from experiments.studies.teams.settings import ALWAYS
+from experiments.studies.teams.claims import HEADLINES, NAMES
+from experiments.studies.teams.settings import ALWAYS, PRINTED
 from experiments.viewing.plotting import draw_interval, set_axes, with_legend
-from experiments.viewing.style import BLACK, BLUE, PURPLE, SKY, WALL, subplots
+from experiments.viewing.style import BLACK, BLUE, ORANGE, PURPLE, SKY, WALL, subplots
 from experiments.viewing.team_figure import draw_paths, draw_sightings
 
-_FILTERS = {"fastslam": (BLUE, "s"), "ekf_slam": (BLACK, "o"), "smoother": (PURPLE, "^")}
+_FILTERS = {
+    PRINTED: (ORANGE, "D"),
+    "fastslam": (BLUE, "s"),
+    "ekf_slam": (BLACK, "o"),
+    "smoother": (PURPLE, "^"),
+}
 
 
 def draw(results: Results) -> dict[str, Figure]:
@@ -24,6 +30,7 @@ def draw(results: Results) -> dict[str, Figure]:
         "teams_drive": drive(results.arrays("drive")),
         "teams_errors": by_size(errors),
         "teams_links": by_link(errors),
+        **region_pages(results, HEADLINES),
     }
 
 

@@ -9,23 +9,29 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from collections.abc import Iterator, Mapping
+import operator
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
+from scipy import stats
 
+from estimators.base import Estimate
 from estimators.landmarks.ekf_slam import EkfSlam
 from estimators.team import Communication, run_team
 from experiments.evaluation.metrics import score
 from experiments.judging.jobs import Progress, Tables, answer_of, tables_of
 from experiments.judging.logs import CALIBRATED_S, MRCLAM_6, calibrate_by_truth, known_start
+from experiments.judging.region_runs import region_jobs, remake_region
 from experiments.judging.remake import Cells, Remake, agrees, whole
-from experiments.judging.results import Profile, Results
+from experiments.judging.results import FIRST_SEED, Profile, Results
+from experiments.judging.sequential import run_worlds
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Row
 from experiments.studies.teams import settings
+from experiments.studies.teams.claims import gi9
 from experiments.viewing.team_figure import drive_of, sightings
 from sim.arrays import Array
 from sim.formats import mrclam
@@ -53,22 +59,44 @@ def run(profile: Profile, out: Results, on_progress: Progress) -> None:
     profile
         `quick`: two worlds.
     """
-    jobs = [
-        (seed, option)
-        for option, n_worlds in settings.WORLDS[profile].items()
-        for seed in range(settings.FIRST_SEED, settings.FIRST_SEED + n_worlds)
-    ]
-    out.write_tables(**tables_of(rows_of, jobs, on_progress))
+    regions = region_jobs("teams", region_run, profile)
+    first = FIRST_SEED[profile]
+    batch = [(rows_of, first + i, "smoother") for i in range(settings.WORLDS[profile])]
+    tables = tables_of(operator.call, [*batch, *regions], lambda share: on_progress(0.5 * share))
+    made = run_worlds("teams", ["GI9"], profile, _worlds, lambda t: list(gi9(t["errors"])))
+    tables["errors"] = pd.concat([tables["errors"], made["errors"]], ignore_index=True)
+    out.write_tables(**tables)
     if MRCLAM_6.exists():
         out.write_tables(mrclam=_mrclam_table())
-    out.write_arrays("drive", **drive(settings.FIRST_SEED))
+    out.write_arrays("drive", **drive(first))
+    on_progress(1.0)
 
 
-REMADE = {"errors": 5.0, "mrclam": 120.0}
+def _worlds(seeds: Sequence[int]) -> Mapping[str, pd.DataFrame]:
+    return tables_of(rows_of, [(seed, option) for seed in seeds for option in settings.FILTERS])
+
+
+def region_run(_name: str, values: Mapping[str, Any], seed: int, profile: Profile) -> Row:
+    """Errors of the printed filter with and without sightings at free settings in one world."""
+    kept, size = dict(values), int(values["team.size"])
+    keys = {**kept, "robot.kl": values["robot.kr"]}
+    if profile is Profile.QUICK:
+        keys["route.distance_m"] = 8.0
+    row: Row = {}
+    for overrides, labels in _arms(size, settings.PRINTED):
+        one = compose_experiment(seed, overrides | keys)
+        found = answer_of(one, ["answer_ate_rmse_m"])["answer_ate_rmse_m"]
+        row["with_m" if labels["sightings"] else "without_m"] = found
+    return row
+
+
+REMADE = {"errors": 5.0, "mrclam": 120.0, "region_GI9": 8.0}
 
 
 def remake(table: str, row: Cells) -> Remake | None:
     """The call that makes a row again; None without the log that it is from."""
+    if table.startswith("region_"):
+        return remake_region("teams", region_run, table, row)
     if table == "errors":
         return rows_of, (int(row["seed"]), row["filter"], row)
     return (whole, (table, _mrclam_table)) if MRCLAM_6.exists() else None
@@ -88,9 +116,26 @@ def rows_of(seed: int, option: str, only: Row | None = None) -> Tables:
             shared = {"seed": seed, "size": size, "filter": option, **labels}
             if only is not None and not agrees(only, shared):
                 continue
-            found = answer_of(compose_experiment(seed, overrides), _KEPT, team)
-            rows.append(shared | {_KEPT[name]: value for name, value in found.items()})
+            held: list[tuple[float, float]] = []
+
+            def hold(own: Recording, _: object, online: Estimate, __: object) -> None:
+                held.append(uncertainty(own, online))  # noqa: B023 - called within the turn
+
+            experiment = compose_experiment(seed, overrides)
+            found = answer_of(experiment, _KEPT, team, on_estimate=hold)
+            inside, sigma_m = np.mean(held, axis=0)
+            row = {_KEPT[name]: value for name, value in found.items()}
+            rows.append(shared | row | {"inside_share": inside, "sigma_m": sigma_m})
     return {"errors": rows}
+
+
+def uncertainty(own: Recording, online: Estimate) -> tuple[float, float]:
+    """Share of true positions inside the belief's 95 % ellipse, and its RMS deviation, m."""
+    off = own.truth_at(online.stamps)[:, :2] - online.means[:, :2]
+    covariances = online.covariances[:, :2, :2] + 1e-12 * np.eye(2)
+    squares = np.sum(off * np.linalg.solve(covariances, off[..., None])[..., 0], axis=1)
+    variance = np.trace(covariances, axis1=1, axis2=2).mean()
+    return float(np.mean(squares <= stats.chi2.ppf(0.95, 2))), math.sqrt(float(variance))
 
 
 def _arms(size: int, option: str) -> Iterator[tuple[dict[str, Any], Row]]:
@@ -98,8 +143,8 @@ def _arms(size: int, option: str) -> Iterator[tuple[dict[str, Any], Row]]:
     for used in (False, True):
         seen = "robots" if used else "null"
         base = {"team.size": size, "estimator": option, "estimator.robots": seen}
-        if option == "fastslam":
-            base["estimator.n_particles"] = settings.N_PARTICLES
+        if option in settings.N_PARTICLES:
+            base["estimator.n_particles"] = settings.N_PARTICLES[option]
         yield base, {"sightings": used, "link": settings.ALWAYS}
     if option == "ekf_slam" and size == settings.LINKED:
         for kind, link in settings.LINKS.items():

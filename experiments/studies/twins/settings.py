@@ -20,7 +20,8 @@ METHODS = {  # of conf/study/twins/KIND.yaml, in its order
         "EKF of wheels and ICP",
     ),
 }
-FIRST_SEED = 1000
+SEGMENT_S = 60.0
+COVERED = 0.85  # of the real errors over a minute, in intervals of 95 %
 RUNS = {Profile.QUICK: 4, Profile.FULL: 50}
 TAU = 0.3  # the smallest effect of interest
 LEAST_SHARE = 17.0 / 20.0  # of the pairs of log and estimator

@@ -6,17 +6,18 @@ import math
 import numpy as np
 import pandas as pd
 
+from estimators.base import Estimate
 from experiments.evaluation.metrics import score
 from experiments.judging.jobs import Progress, Tables, tables_of
 from experiments.judging.logs import known_start, why_missing
 from experiments.judging.remake import Cells, Remake
-from experiments.judging.results import Profile, Results
+from experiments.judging.results import FIRST_SEED, Profile, Results
 from experiments.runs.evaluate import run_over
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Row
 from experiments.runs.seeds import stream
+from experiments.studies.twins.segments import score_segments, segment_errors_m
 from experiments.studies.twins.settings import (
-    FIRST_SEED,
     LANDMARKS,
     LOGS,
     METHODS,
@@ -42,11 +43,12 @@ def run(profile: Profile, out: Results, on_progress: Progress) -> None:
         `quick`: 4 simulations of each log in place of 50.
     """
     runs = _planned()
-    seeds = range(FIRST_SEED, FIRST_SEED + RUNS[profile])
+    seeds = range(FIRST_SEED[profile], FIRST_SEED[profile] + RUNS[profile])
     jobs = [(log, seed, runs) for log in LOGS for seed in (None, *seeds)]
     made = tables_of(errors, jobs, on_progress)
     pairs = predict_pairs(made["runs"])
-    out.write_tables(**made, pairs=pairs, others=held_by_others(pairs))
+    minutes = score_segments(made["segments"])
+    out.write_tables(**made, pairs=pairs, others=held_by_others(pairs), minutes=minutes)
 
 
 def _planned() -> dict[str, dict[str, Experiment]]:
@@ -57,7 +59,7 @@ def _planned() -> dict[str, dict[str, Experiment]]:
     }
 
 
-REMADE = {"runs": 60.0}  # the others are made of it
+REMADE = {"runs": 60.0, "segments": 60.0}  # the others are made of it
 
 
 def remake(_table: str, row: Cells) -> Remake | None:
@@ -82,22 +84,24 @@ def errors(log: str, seed: int | None, runs: dict[str, dict[str, Experiment]]) -
     kind = SCANS if twin.grid is not None else LANDMARKS
     recording = twin.rest if seed is None else twin.simulate(seed)
     about: Row = {"log": log, "kind": kind, "seed": -1 if seed is None else seed}
-    rows = [
-        {**about, "method": name, "status": recording.status, **_error(twin, run, recording, seed)}
-        for name, run in runs[kind].items()
-    ]
-    return {"runs": rows}
+    rows, segments = [], []
+    for name, run in runs[kind].items():
+        online = _estimate(twin, run, recording, seed)
+        scores, label = score(recording, online), {**about, "method": name}
+        found = {key: scores.get(key, math.nan) for key in _SCORES}
+        rows.append({**label, "status": recording.status, **found})
+        for i, error_m in enumerate(segment_errors_m(recording, online)):
+            segments.append({**label, "segment": i, "error_m": float(error_m)})
+    return {"runs": rows, "segments": segments}
 
 
-def _error(twin: Twin, run: Experiment, recording: Recording, seed: int | None) -> Row:
+def _estimate(twin: Twin, run: Experiment, recording: Recording, seed: int | None) -> Estimate:
     """Run an estimator from the true start; it believes the calibration's slip."""
     slip = vars(twin.found.calibration.slip)
     believed = {key: value for key, value in slip.items() if run.option(key) is not None}
     estimator = run.with_estimator(**believed).estimator()
     rng = stream(seed or 0, f"estimator/{run.estimator_name}")
-    online, _ = run_over(recording, estimator, known_start(recording), rng)
-    scores = score(recording, online)
-    return {key: scores.get(key, math.nan) for key in _SCORES}
+    return run_over(recording, estimator, known_start(recording), rng)[0]
 
 
 def predict_pairs(runs: pd.DataFrame) -> pd.DataFrame:

@@ -39,8 +39,9 @@ def test_the_sentence_says_the_factors():
     found = [*claims.gi10(table_of(spread=1e-6))]
     [conclusion] = conclude(found, findings("exploration"))
     assert conclusion.verdict is Verdict.REPRODUCED
-    assert "1.3 times the area" in conclusion.sentence
-    share = select(found, quantity="hit something", method="coordinated")
+    assert "1.3] times the area" in conclusion.sentence
+    assert "one building, shows it in 20 of 20 cases" in conclusion.sentence
+    share = select(found, quantity="hit something", method=settings.JUDGED)
     assert share.found.value == 1.0 / (settings.N_ROBOTS * 20)
 
 
@@ -55,7 +56,7 @@ def test_figures_draw(tmp_path):
     made.write_tables(coverage=pd.concat(curves))
     square = np.array([[0.0, 0, 4, 0], [4, 0, 4, 4]])
     paths = {f"truth_{k}": np.cumsum(np.ones((5, 2)), axis=0) + k for k in range(3)}
-    for name in (settings.BASE, settings.JUDGED):
+    for name in (settings.BASE, settings.BOTH):
         heights = np.tile([0.0, 2.5], (2, 1))
         made.write_arrays(f"drive_{name}", walls=square, wall_z_m=heights, **paths)
     pages = figures.draw(made)

@@ -1,0 +1,186 @@
+"""The runs over the regions of a study's claims, and what they say of each claim.
+
+A study's `region_run(name, values, seed, profile)` drives all arms at free settings in one world
+and returns their levels, which are columns of the table `region_NAME`. Claims with the same
+settings share it (`like` in the findings).
+"""
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+
+from experiments.judging.claim import Claim, waiting
+from experiments.judging.free_settings import FreeSettings, free_settings, sample
+from experiments.judging.jobs import Tables
+from experiments.judging.region import Fitted, Region, Side, describe, fit
+from experiments.judging.region_figure import draw_region
+from experiments.judging.remake import Cells, Remake
+from experiments.judging.results import FIRST_SEED, Profile, Results
+from experiments.runs.row import Row
+from experiments.runs.seeds import stream
+from sim.arrays import Array
+from sim.errors import require
+
+Run = Callable[[str, Mapping[str, Any], int, Profile], Row]
+Job = tuple[Callable[..., Tables], Run, str, int, Mapping[str, Any], int, Profile]
+N_POINTS = {Profile.FULL: 64, Profile.QUICK: 16}
+N_WORLDS = {Profile.FULL: 6, Profile.QUICK: 2}  # at each point
+_APART = {Profile.FULL: 1000, Profile.QUICK: 0}  # from the seeds of the worlds at the anchor
+_LEAST_POINTS = 8
+
+
+@dataclass(frozen=True)
+class Compared:
+    """A headline over the region: the ratio of two columns, and the claim's side of it.
+
+    Attributes
+    ----------
+    first, second
+        Columns; without a second, the first is the ratio itself.
+    words
+        The ratio in words.
+    at_least, at_most
+        The criterion, as a ratio.
+    printed
+        The paper's own ratio, if it prints one.
+    """
+
+    first: str
+    second: str
+    words: str
+    at_least: float = 0.0
+    at_most: float = math.inf
+    printed: float | None = None
+
+    def logs(self, table: pd.DataFrame) -> Array:
+        """Log ratio of each row; not finite where a run failed."""
+        below = table[self.second] if self.second else 1.0
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.asarray(np.log((table[self.first] / below).to_numpy(float)))
+
+    def side(self, effect: float) -> Side:
+        """The claim's side, by the smallest effect of interest."""
+        low = math.log(self.at_least) if self.at_least else -math.inf
+        return Side(low, math.log(self.at_most), effect)
+
+
+Headlines = Mapping[str, Sequence[Compared]]  # by the claim's id
+
+
+def region_jobs(study: str, run: Run, profile: Profile) -> list[Job]:
+    """The calls that make the tables of a study's regions, for `operator.call`."""
+    n_worlds = N_WORLDS[profile]
+    first = FIRST_SEED[profile] + _APART[profile]
+    return [
+        (_region_row, run, name, point, values, first + n_worlds * point + world, profile)
+        for name, free in free_settings(study).items()
+        if free.runs == name
+        for point, values in enumerate(_points(study, name, free, profile))
+        for world in range(n_worlds)
+    ]
+
+
+def _points(study: str, name: str, free: FreeSettings, profile: Profile) -> list[dict[str, Any]]:
+    drawn = sample(free.settings, N_POINTS[profile], rng=stream(0, f"region/{study}/{name}"))
+    return [{str(key): value for key, value in row.items()} for row in drawn.to_dict("records")]
+
+
+def _region_row(
+    run: Run, name: str, point: int, values: Mapping[str, Any], seed: int, profile: Profile
+) -> Tables:
+    row = {"point": point, "seed": seed, **values, **run(name, values, seed, profile)}
+    return {f"region_{name}": [row]}
+
+
+def remake_region(study: str, run: Run, table: str, row: Cells) -> Remake:
+    """The call that makes a row of a region's table again."""
+    name = table.removeprefix("region_")
+    values = {each.name: row[each.name] for each in free_settings(study)[name].settings}
+    return _region_row, (run, name, int(row["point"]), values, int(row["seed"]), Profile.FULL)
+
+
+def is_there(results: Results, claim: str) -> bool:
+    """Whether a claim has no region, or the runs over it are there."""
+    free = free_settings(results.paper).get(claim)
+    return free is None or results.optional_table(f"region_{free.runs}") is not None
+
+
+def judge_tables(
+    results: Results,
+    claims: Mapping[
+        str, tuple[Callable[..., Claim | Iterable[Claim]], Mapping[str, Sequence[str]]]
+    ],
+) -> list[Claim]:
+    """Judge each claim by its tables; one whose tables are older than its definition waits.
+
+    Parameters
+    ----------
+    claims
+        By id: what judges it, and the tables that it is given, with the columns that older ones
+        lack. A table that has such columns may be missing as a whole.
+    """
+    found: list[Claim] = []
+    for claim, (judge, tables) in claims.items():
+        given = [
+            results.optional_table(name) if columns else results.table(name)
+            for name, columns in tables.items()
+        ]
+        is_old = any(
+            table is None or not set(columns) <= set(table)
+            for table, columns in zip(given, tables.values(), strict=True)
+        )
+        if is_old or not is_there(results, claim):
+            found.append(waiting(claim))
+            continue
+        made = judge(*given)
+        found += [made] if isinstance(made, Claim) else list(made)
+    return found
+
+
+def fitted_regions(
+    results: Results, headlines: Headlines
+) -> Iterator[tuple[str, FreeSettings, pd.DataFrame, Fitted]]:
+    """Give each claim's id, free settings, sampled points, and surfaces, as far as runs are there.
+
+    Points at which a run failed are left out.
+    """
+    for claim, free in free_settings(results.paper).items():
+        table = results.optional_table(f"region_{free.runs}")
+        if table is None:
+            continue
+        table = table.sort_values(["point", "seed"])
+        every = np.stack([each.logs(table) for each in headlines[claim]])
+        is_whole = pd.Series(np.isfinite(every).all(axis=0), table.index)
+        kept = is_whole.groupby(table["point"]).transform("all").to_numpy()
+        points = table[kept].groupby("point", as_index=False).first()
+        words = f"region of {claim}: runs failed at all but {len(points)} points"
+        require(len(points) >= _LEAST_POINTS, words)
+        arms = [
+            (logs[kept].reshape(len(points), -1), each.side(free.effect))
+            for logs, each in zip(every, headlines[claim], strict=True)
+        ]
+        yield claim, free, points, fit(free.settings, points, arms, stream(0, f"region/{claim}"))
+
+
+def judged_regions(results: Results, headlines: Headlines) -> dict[str, Region]:
+    """What each claim's region says of it, as far as the runs are there."""
+    return {
+        claim: describe(fitted, free.anchor)
+        for claim, free, _, fitted in fitted_regions(results, headlines)
+    }
+
+
+def region_pages(results: Results, headlines: Headlines) -> dict[str, Figure]:
+    """A figure of each claim's region, as far as the runs are there."""
+    return {
+        f"{results.paper}_region_{claim}": draw_region(
+            fitted, points, free.drawn_anchor, title=f"Where {claim} holds",
+            quantity=headlines[claim][0].words, printed=headlines[claim][0].printed,
+        )
+        for claim, free, points, fitted in fitted_regions(results, headlines)
+    }  # fmt: skip
