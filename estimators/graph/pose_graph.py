@@ -24,11 +24,15 @@ _NARROWED = 8.0  # by this factor the loss of closures is narrowed from one solu
 
 @dataclass(frozen=True, eq=False)
 class Edge:
-    """The measured pose of node `second` in the frame of node `first`."""
+    """The measured pose of node `second` in the frame of node `first`.
+
+    `support_m` is the way over which others must agree before it is believed.
+    """
 
     first: int
     second: int
     motion: Gaussian
+    support_m: float = 0.0
 
 
 class PoseGraph:
@@ -145,7 +149,15 @@ class PoseGraph:
         cost that a last step may still gain.
         """
         self.closures += edges
-        sigma = max(self._robust_sigma, self._farthest(edges))
+        self._settle(max(self._robust_sigma, self._farthest(edges)), tolerance)
+
+    def keep(self, closures: list[Edge], tolerance: float = 1e-9) -> None:
+        """Let go of all other closures, and move all nodes to the least-squares solution."""
+        self.closures = closures
+        self._settle(self._robust_sigma, tolerance)
+
+    def _settle(self, sigma: float, tolerance: float) -> None:
+        """Solve with a loss of this width, then with ever narrower ones."""
         while True:
             how = LeastSquaresOptions(robust="dcs", robust_sigma=sigma)
             solution = solve(self._problem(), self.poses, how, tolerance=tolerance)
@@ -160,12 +172,14 @@ class PoseGraph:
         self._own[-1] = (self._cross[-1] + self._cross[-1].T) / 2.0
         self._current = np.arange(n) == n - 1
 
-    def _farthest(self, edges: list[Edge]) -> float:
-        """Greatest Mahalanobis distance of closures from the graph, by their own noise."""
-        first, second, measured, noise = _stacked(edges)
+    def misses(self, edges: list[Edge] | None = None) -> Array:
+        """Mahalanobis distances (K,) of edges from the graph, by their own noise; of closures."""
+        first, second, measured, noise = _stacked(self.closures if edges is None else edges)
         off = se2.difference(measured, se2.between(self.poses[first], self.poses[second]))
-        squared = np.sum(times(whitening_of(noise), off) ** 2, axis=1)
-        return float(np.sqrt(squared.max(initial=0.0)))
+        return np.asarray(np.sqrt(np.sum(times(whitening_of(noise), off) ** 2, axis=1)))
+
+    def _farthest(self, edges: list[Edge]) -> float:
+        return float(self.misses(edges).max(initial=0.0))
 
     def marginals(self) -> Array:
         """(N, 3, 3) covariance of every node."""

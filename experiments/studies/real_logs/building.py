@@ -38,15 +38,6 @@ from sim.recording import Recording
 from sim.sensors import Laser
 
 _ORIGIN = np.zeros(3)
-# Ten times the laser's noise is believed of scans, since walls are not straight and people pass.
-# Chosen when no line was left out yet.
-_OPTIONS: dict[str, Any] = {
-    "sigma_range_m": 0.1,
-    "max_gap_m": None,
-    "gate_probability": 1e-6,
-    "kr": 1e-3,
-    "kl": 1e-3,
-}
 # Of the Intel robot, as for `ekf_icp`
 _WHEELED: dict[str, Any] = {"kr": 3e-3, "kl": 3e-3, "lateral_slip_m": 3e-3}
 
@@ -72,12 +63,12 @@ def scored(
     T_base_judged
         (3,) Frame of the relations, in base_link.
     options
-        Of `estimators.graph.graph_slam.GraphSlam`, besides those of all logs.
+        Of `estimators.graph.graph_slam.GraphSlam`; none but what is believed of the wheels.
     """
     scans, graph = recording.log("laser").stamps, carmen.read_carmen(GRAPHS[name])
     known = scans if known_stamps is None else known_stamps
     judged = judged_relations(relations_of(name), known, graph.scan_stamps)
-    online, revised = track(GraphSlam(**_OPTIONS | options), recording)
+    online, revised = track(GraphSlam(**options), recording)
     assert revised is not None
     at_scans = np.searchsorted(online.stamps, scans)
     rows: list[Row] = [
@@ -102,7 +93,7 @@ def closed_loops() -> tuple[pd.DataFrame, dict[str, NDArray[Any]]]:
     """Errors on all logs, and grids of Intel by its edges alone and with its loops closed."""
     edges = carmen.to_recording(carmen.read_carmen(GRAPHS["intel"]))
     rows, after = scored("intel", "SEQUENTIAL edges", edges)
-    before, _ = track(Odometry(kr=_OPTIONS["kr"], kl=_OPTIONS["kl"]), edges)
+    before, _ = track(Odometry(), edges)
     rows += scored("fr079", "SEQUENTIAL edges", freiburg())[0]
     wheels, logged = intel("calibrated"), intel("logged")
     mounts = [one.sensor("laser", Laser).mount.pose for one in (wheels, logged)]

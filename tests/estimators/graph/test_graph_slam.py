@@ -10,8 +10,10 @@ from estimators.gaussian import Gaussian
 from estimators.graph import least_squares
 from estimators.graph.graph_slam import GraphSlam
 from estimators.graph.least_squares import LeastSquaresOptions, Problem, solve
-from estimators.graph.loop_closing import LoopOptions, LoopSearch, look_alike, signature
+from estimators.graph.loop_closing import LoopOptions, LoopSearch, Patches, Seen
+from estimators.graph.place_search import agreement, make_patch
 from estimators.graph.pose_graph import Edge, PoseGraph
+from estimators.graph.residual_noise import ResidualNoise
 from estimators.laser.icp import prepare
 from estimators.laser.scan_lines import without_sparse_lines
 from estimators.laser.scan_matching import MatcherOptions, ScanMatcher
@@ -191,13 +193,68 @@ def test_agrees_with_gtsam():
     assert np.trace(mine) == pytest.approx(np.trace(theirs), rel=0.05)
 
 
-def test_scans_look_alike_from_any_heading():
-    laser = Laser(n_beams=361, fov_rad=2.0 * np.pi)
-    poses = np.array([[0.5, -1.0, 0.4], [0.5, -1.0, 2.4], [0.3, -0.8, 1.0]])
-    seen = [prepare(r, laser.bearings_rad) for r in room_ranges_m(laser, poses)]
-    tiny = prepare(0.3 * room_ranges_m(laser, poses[:1])[0], laser.bearings_rad)
-    marks = np.array([signature(scan) for scan in (*seen, tiny)])
-    assert look_alike(marks[0], marks).tolist() == [True, True, True, False]
+def two_visits(n_rooms, return_to, sigma_m):
+    """Rooms in a row that look the same, 9 m apart, and then again one of them.
+
+    The robot knows only its way within a room; between rooms it may be off by `sigma_m`.
+    """
+    laser = Laser(n_beams=121, fov_rad=np.pi)
+    within = np.column_stack([np.linspace(-1.5, 1.0, 11), np.linspace(-1.0, 1.2, 11), np.zeros(11)])
+    scans = [prepare(ranges, laser.bearings_rad) for ranges in room_ranges_m(laser, within)]
+    starts = [np.array([9.0 * k, 0.0, 0.0]) for k in [*range(n_rooms), return_to]]
+    truth = np.concatenate([[np.zeros(3)], *(start + within for start in starts)])
+    graph, patches = PoseGraph(Gaussian(np.zeros(3), 1e-4 * np.eye(3)), 5.0), Patches(np.zeros(3))
+    patches.key_frames.append(Seen(None, 0.0))
+    for k, motion in enumerate(se2.between(truth[:-1], truth[1:])):
+        leaps = k % 11 == 0
+        noise = np.diag(np.square([sigma_m, sigma_m, 0.02] if leaps and k else [0.01, 0.01, 0.002]))
+        graph.add(motion, [Gaussian(motion, noise)])
+        driven_m = patches.key_frames[-1].driven_m + (10.0 if leaps else np.hypot(*motion[:2]))
+        patches.key_frames.append(Seen(scans[k % 11], driven_m))
+    how = LoopSearch(ScanMatcher(MatcherOptions()), laser, LoopOptions())
+    return how.find_place(graph, patches, len(graph) - 1, patches.anchors()), truth
+
+
+def test_a_place_that_was_seen_before_is_found():
+    found, truth = two_visits(n_rooms=1, return_to=0, sigma_m=1.0)
+    anchor, place = found
+    np.testing.assert_allclose(place.mean, se2.between(truth[anchor], truth[-1]), atol=0.1)
+    assert np.sqrt(np.diag(place.covariance)).max() < 1.0
+
+
+def test_of_places_that_look_alike_none_is_found():
+    """The nearest is right, but the uncertainty reaches the other: no closure until it is known."""
+    assert two_visits(n_rooms=2, return_to=1, sigma_m=4.0)[0] is None
+    assert two_visits(n_rooms=2, return_to=1, sigma_m=0.5)[0] is not None
+
+
+def test_walls_in_free_space_deny_a_place():
+    laser = Laser(n_beams=121, fov_rad=np.pi)
+    scan = prepare(room_ranges_m(laser, np.zeros((1, 3)))[0], laser.bearings_rad)
+    patch = make_patch(np.zeros((1, 3)), [scan.points], np.zeros(3))
+    assert agreement(patch, patch, np.zeros(3)) == (1.0, pytest.approx(1.0, abs=0.1))
+    assert agreement(patch, patch, np.array([1.0, 0.0, 0.0]))[0] < 0.5
+
+
+def test_noise_follows_from_what_wheels_and_scans_say():
+    """Wheels with a fifth of their noise believed, and a gain; scans with a tenth of theirs."""
+    rng, noise = np.random.default_rng(9), ResidualNoise()
+    wheels, scans = np.array([0.02, 0.01, 0.03]), np.array([0.004, 0.004, 0.002])
+    for _ in range(300):
+        truth = np.array([0.5, 0.0, rng.uniform(-0.3, 0.3)])
+        logged = truth * [1.04, 1.0, 0.95] + wheels * rng.standard_normal(3)
+        by_wheels = Gaussian(logged, np.diag(np.square(wheels / 5.0)))
+        noise.compare_wheels(by_wheels, Gaussian(truth, 1e-8 * np.eye(3)))
+        R = np.diag(np.square(scans / 10.0))
+        ties = [Gaussian(truth + scans * rng.standard_normal(3), R) for _ in range(2)]
+        twice = Gaussian(truth, R).then(Gaussian(truth, R)).mean
+        direct = Gaussian(twice + scans * rng.standard_normal(3), R)
+        noise.compare_scans(direct, *ties)
+    found = noise.corrected(by_wheels)
+    np.testing.assert_allclose(np.sqrt(np.diag(found.covariance)), wheels, rtol=0.25)
+    assert np.sqrt(noise.of_scans) == pytest.approx(10.0, rel=0.2)
+    straight = noise.corrected(Gaussian(np.array([0.52, 0.0, 0.0]), np.eye(3)))
+    assert straight.mean[0] == pytest.approx(0.5, abs=0.01)
 
 
 def test_edges_far_behind_one_another_are_no_wall():
@@ -283,6 +340,29 @@ def test_false_closures_are_not_believed(laps, monkeypatch):
     assert planted
     assert not [edge for edge in planted if edge in estimator.graph.closures]
     assert error_m(laps, online).max() < 0.03
+
+
+def test_a_false_loop_is_withdrawn_when_what_follows_denies_it(laps):
+    """Planted and believed after a lap; the walls that are seen from then on do not fit."""
+    estimator = GraphSlam(kr=5e-4, kl=5e-4, keyframe_distance_m=0.3, robust_sigma=1e4)
+    planted = None
+
+    def step(frame):
+        nonlocal planted
+        belief = stepped(frame)
+        newest = len(estimator.graph) - 1
+        if planted is None and estimator._patches.key_frames[-1].driven_m > 8.5:
+            off = se2.between(estimator.graph.poses[2], estimator.graph.poses[newest])
+            planted = Edge(2, newest, Gaussian(off + np.array([1.5, 1.0, 0.4]), 1e-7 * np.eye(3)))
+            estimator.graph.keep([planted])
+            estimator._groups = [newest]
+        return belief
+
+    stepped, estimator.step = estimator.step, step
+    online = run(estimator, laps, tracking_prior(laps), np.random.default_rng(0))
+    assert error_m(laps, online).max() > 0.5  # it was believed
+    assert planted not in estimator.graph.closures
+    assert error_m(laps, estimator.finish()).max() < 0.1
 
 
 def test_without_closures_it_is_a_chain(laps):
