@@ -33,7 +33,6 @@ from experiments.runs.seeds import stream
 from experiments.runs.targets import make
 from sim.arrays import Array
 from sim.errors import InputError, blaming, require, required
-from sim.formats.detect import read_all
 from sim.options import build
 from sim.people.walk import People
 from sim.recording import Frame, Recording
@@ -240,6 +239,8 @@ class Objects:
 
     def _loaded(self, path: Path) -> Team:
         """The robots of a file, as they are believed to be."""
+        from sim.formats.detect import read_all  # here, so that it counts where a log is read
+
         team = read_all([path])
         if self.team is not None:
             require(self.size <= len(team), f"{path}: a team of {len(team)} robots; set team.size")

@@ -71,14 +71,14 @@ def digest_of_defaults(options):
 # A default decides results: who changes one says so in CHANGELOG.md, and here.
 DEFAULTS = {
     "DifferentialDrive": "4c424886",
-    "EkfIcp": "a038b4e8",
+    "EkfIcp": "1c08f29d",
     "EkfIcpPaper": "ef960ab5",
     "EkfSlam": "3a17fe07",
     "Encoder": "9c7c1c0b",
     "External": "a594d99f",
     "FastSLAM": "8a3a567e",
     "FixedLag": "c8a5ff52",
-    "GraphSlam": "fd507c8e",
+    "GraphSlam": "f4b95616",
     "GtsamBatch": "644cfc1c",
     "GtsamIsam2": "d3a09e69",
     "Gyroscope": "819bc6ea",

@@ -18,8 +18,8 @@ from estimators.laser.icp import prepare
 from estimators.laser.scan_lines import without_sparse_lines
 from estimators.laser.scan_matching import MatcherOptions, ScanMatcher
 from estimators.odometry import Odometry
+from experiments.evaluation.relations import judged_relations
 from experiments.gate.conform import check_estimator
-from experiments.studies.real_logs import building
 from sim import se2
 from sim.errors import InputError
 from sim.formats.relations import Relations
@@ -277,7 +277,7 @@ def test_relations_of_unknown_stamps_and_of_a_scan_with_itself_judge_nothing():
     stamps = np.array([[0.0, 10.0], [0.0, 0.02], [0.0, 20.0], [10.0, 20.0]])
     relations = Relations(stamps, np.arange(12.0).reshape(4, 3))
     known, others = np.array([0.01, 10.0, 19.0]), np.array([0.0, 0.02, 10.04, 20.0])
-    assert building._shared(relations, known, others).stamps.tolist() == [[0.0, 10.0]]
+    assert judged_relations(relations, known, others).stamps.tolist() == [[0.0, 10.0]]
 
 
 # --- the estimator -------------------------------------------------------------------------------

@@ -42,7 +42,7 @@ def complete(line, **environment):
         ),
         ("estima options me", {"metrics"}),
         ("estima table sl", {"slip"}),
-        ("estima plot slip --y nees_m", {"nees_mean"}),
+        ("estima plot slip --y nees_me", {"nees_mean", "nees_median"}),
         ("estima check --only fastslam_", {"fastslam_paper"}),
     ],
 )
