@@ -17,7 +17,7 @@ from experiments.runs.paths import SOURCE
 from sim.errors import InputError
 
 JUDGED = SOURCE / "results"
-NEW = {"segments"}  # a table that waits for the judged run, as those of regions do
+NEW = {"segments", "said"}  # tables that wait for the judged run, as those of regions do
 
 
 @pytest.fixture(autouse=True)

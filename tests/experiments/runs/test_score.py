@@ -197,7 +197,7 @@ def test_a_row_is_an_ordinary_one(files, tmp_path, monkeypatch, capsys):
     assert "revised path, not aligned" in out
     code, out, err = run(monkeypatch, capsys, "table", "score", "--times")
     assert code == 0, err
-    assert [line.split()[:3] for line in out.splitlines()[3:]] == [
+    assert [line.split()[:3] for line in out.splitlines()[3:5]] == [
         ["batch", "1", "revised"],
         ["est", "1", "online"],
     ]
