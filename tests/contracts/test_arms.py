@@ -1,12 +1,14 @@
 """What is compared differs in nothing but what is compared: starts, stops, seeds, beliefs."""
 
 import json
+from functools import partial
 
 import numpy as np
 import pytest
 
 from estimators.laser import icp
 from experiments.bench import icp as bench
+from experiments.papers.decristoforis2020 import pairs
 from experiments.papers.decristoforis2020 import study as decristoforis2020
 from experiments.papers.gil2008 import study
 from experiments.papers.gil2008.recordings import Scene
@@ -133,8 +135,17 @@ def test_particle_filters_are_compared_by_the_same_m_and_repeats():
     assert own["fastslam"] == own["fastslam_paper"]
 
 
+def as_judged(study_name, seeds):
+    """Drives of decristoforis2020 as its claims' designs run them: drives at the anchor."""
+    jobs_of = {
+        "methods": partial(decristoforis2020._drives, []),
+        "corridor": decristoforis2020._corridors,
+    }
+    return [group for _, group in jobs_of[study_name](seeds)]
+
+
 def test_methods_of_decristoforis2020_share_drive_and_beliefs():
-    (group,) = decristoforis2020._planned("methods", 1)
+    (group,) = as_judged("methods", [1000])
     assert differing(group) == {"method"}
     assert len({run.recording_key for run in group}) == 1
     printed = [run for run in group if run.config["method"] != "fusion_clone"]
@@ -148,19 +159,22 @@ def test_methods_of_decristoforis2020_share_drive_and_beliefs():
 
 
 def test_the_fusion_of_decristoforis2020_is_the_printed_one():
-    (group,) = decristoforis2020._planned("methods", 1)
+    (group,) = as_judged("methods", [1000])
     (fusion,) = (run for run in group if run.config["method"] == "fusion")
     own = fusion.config["estimator"]
     assert own["_target_"] == "estimators.laser.ekf_icp_paper.EkfIcpPaper"
     assert (own["metric"], own["covariance"]) == ("point_to_plane", "censi_last")
     assert own["lateral_slip_m"] == 0.0
-    assert fusion.config["sensors"]["laser"]["rate_hz"] == 75.0
+    assert (
+        fusion.config["sensors"]["laser"]["rate_hz"] == 18.75
+    )  # as printed: 721 beams take four turns at 75 Hz
+    assert fusion.config["sensors"]["laser"]["n_beams"] == 721
     assert fusion.config["route"]["distance_m"] == 100.0
 
 
 def test_offices_and_corridors_of_decristoforis2020_differ_from_seed_to_seed():
     for study_name, n in (("methods", 40), ("corridor", 20)):
-        groups = decristoforis2020._planned(study_name, n)
+        groups = as_judged(study_name, range(1000, 1000 + n))
         assert [group[0].seed for group in groups] == list(range(1000, 1000 + n))
         assert all(differing(group) <= {"method"} for group in groups)
     worlds = [group[0].world() for group in groups[:3]]
@@ -175,15 +189,16 @@ def test_metrics_register_the_same_scans(monkeypatch):
         asked.append((source, target, guess, options))
         return found(source, target, guess, **options)
 
-    found = decristoforis2020.register
-    monkeypatch.setattr(decristoforis2020, "register", register)
-    decristoforis2020._metrics(1000, "room_small")
+    found = pairs.register
+    monkeypatch.setattr(pairs, "register", register)
+    pairs.metrics_of(1000, "room_small", icp.Rules(neighbours=9))
     first, *others = asked
     for source, target, guess, options in others:
         assert source is first[0]
         assert target is first[1]
         assert guess is first[2]
-        assert set(options) == {"metric"}
+        assert set(options) == {"metric", "rules"}
+        assert options["rules"] == icp.Rules(neighbours=9)
 
 
 def test_planes_and_points_have_the_same_stages_and_end(monkeypatch):

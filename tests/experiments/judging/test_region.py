@@ -232,7 +232,7 @@ def test_the_figure_shows_region_anchor_and_the_papers_number():
 
 def test_criteria_say_since_when_and_whether_after_the_data(monkeypatch):
     assert criteria("gil2008")("GI3") == {"criterion_since": "2026-11-23", "after_data": "yes"}
-    assert criteria("gil2008")("GI2") == {"criterion_since": "2026-11-21", "after_data": "no"}
+    assert criteria("gil2008")("GI6") == {"criterion_since": "2026-11-21", "after_data": "no"}
     wrong = {"criteria": {"X1": {"since": "today", "after_data": True}}}
     monkeypatch.setattr("experiments.judging.claims_file.findings", lambda study: wrong)
     with pytest.raises(InputError, match=r"s/findings.yaml: criteria.X1: needs since"):

@@ -94,7 +94,8 @@ def test_each_claim_gets_one_row_and_one_line(results, capsys):
     assert row == {
         "id": "GI1",
         "paper": PAPER,
-        "says": "The error of odometry grows without bound, that of the filter stays bounded.",
+        "says": "The error of odometry grows without bound, that of the filter stays within an "
+        "interval, in position and in heading.",
         "verdict": "reproduced",
         "sentence": "The share is 0.5. Half of it.",
     }

@@ -95,7 +95,9 @@ def test_a_study_runs_in_blocks_until_its_headline_is_decided(gain, verdict, mos
         sizes.append(n)
         return particles(n, gain)
 
-    table, found = run_until_decided(design.looks, run_to, lambda t: [*gil2008.gi3(t, design)])
+    table, found = run_until_decided(
+        design.looks, run_to, lambda t: [*gil2008.gi3(t, None, design)]
+    )
     assert select(found, quantity="position", arm=None).verdict == verdict
     assert sizes == list(design.looks[: len(sizes)])
     assert sizes[-1] <= most
@@ -107,7 +109,7 @@ def test_a_study_ends_at_its_cap():
     table, found = run_until_decided(
         design.looks,
         lambda n: sizes.append(n) or particles(n, 1.25),
-        lambda t: [*gil2008.gi3(t, design)],
+        lambda t: [*gil2008.gi3(t, None, design)],
     )
     claim = select(found, quantity="position", arm=None)
     assert (claim.verdict, sizes, len(table)) == ("undecided", [20, 30], 60)

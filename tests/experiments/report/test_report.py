@@ -149,7 +149,7 @@ def test_each_claim_is_one_row_with_its_statistics_below(text):
     assert "follows from its headline statistics" in page.all("caption")[0]["text"]
     assert "3 claims, by 5 statistics" in page.all("header")[0]["text"]
     *_, tile = (e["text"] for e in page.all("li") if "Covariance of dead" in e["text"])
-    assert tile.endswith("1 reproduced, 1 not reproduced, 1 undecided")
+    assert tile.endswith("1 reproduced, 1 undecided; our own additions: 1 not reproduced")
     assert "of 95 % unless the statistic says otherwise" in page.all("header")[0]["text"]
     assert "not judged yet" in rows["claim-GI8"]
     assert "nobody described" in rows["claim-ZZ9"]
