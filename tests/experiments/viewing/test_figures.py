@@ -77,23 +77,6 @@ def test_the_drive_drawn_tells_its_errors():
     assert told == "300 m, seed 0; RMSE: odometry 1.00 m, ICP 0.50 m, fusion 0.10 m"
 
 
-def test_the_map_of_the_order_has_intervals_and_its_boundary():
-    table = pd.concat(
-        runs({"odometry": 1e4, "icp": 1.0, "fusion": ratio, "fusion_clone": ratio}).assign(
-            k_m=k, sigma_range_m=0.01, heading_rmse_rad=lambda t: t["ate_rmse_m"]
-        )
-        for k, ratio in ((1e-6, 2.0), (1e-4, 0.5))
-    )
-    page = decristoforis2020.ordering(table)
-    fused, alone, same = page.axes[:3]
-    assert [text.get_text() for text in fused.texts] == ["2\n2–2", "0.5\n0.5–0.5"]
-    (boundary,) = fused.lines
-    np.testing.assert_array_equal(boundary.get_xdata(), [0.5, 0.5])
-    assert not alone.lines  # better everywhere
-    assert {text.get_text() for text in same.texts} == {"1\n1–1"}
-    assert page.axes[-1]._colorbar.extend == "both"
-
-
 def test_shares_end_at_one():
     starts = pd.DataFrame({"median_m": [0.1, 0.2], "rms_m": [0.2, 0.3], "spacing_m": 6.0})
     kinds = list(maximo2024.describers.KINDS)
