@@ -13,6 +13,11 @@ from experiments.cli.flags import ConfigDir, gathered
 from experiments.runs import paths
 from sim.errors import require
 
+SuiteName = Annotated[
+    str,
+    typer.Option(help="Suite of conf/suite, or a .yaml file.", autocompletion=completion.suites),
+]
+
 
 def reproduce(
     full: Annotated[bool, typer.Option("--full", help="Make every row again.")] = False,
@@ -243,12 +248,7 @@ def check(
 def bisect(
     good: Annotated[str, typer.Argument(help="A git revision at which nothing was worse.")],
     bad: Annotated[str, typer.Argument(help="A later one, at which something is.")] = "HEAD",
-    suite: Annotated[
-        str,
-        typer.Option(
-            help="Suite of conf/suite, or a .yaml file.", autocompletion=completion.suites
-        ),
-    ] = "check",
+    suite: SuiteName = "check",
     only: Annotated[
         list[str] | None,
         typer.Option(
@@ -281,12 +281,7 @@ def history(
     append: Annotated[
         bool, typer.Option("--append", help="Run the suite there, and keep the errors.")
     ] = False,
-    suite: Annotated[
-        str,
-        typer.Option(
-            help="Suite of conf/suite, or a .yaml file.", autocompletion=completion.suites
-        ),
-    ] = "history",
+    suite: SuiteName = "history",
     speed: Annotated[
         str | None,
         typer.Option(help="With --append: time steps too, in turn with this git revision's."),

@@ -8,7 +8,6 @@ import dataclasses
 import hashlib
 import json
 import secrets
-import shutil
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
@@ -20,7 +19,7 @@ import numpy as np
 import pandas as pd
 from pydantic import Field, Strict
 
-from estimators.programs.program import ProgramError, ProgramOptions
+from estimators.programs.program import ProgramError
 from experiments.gate.conform import CheckResult, check_estimator, example
 from experiments.runs import paths
 from experiments.runs.columns import STATUS
@@ -28,11 +27,12 @@ from experiments.runs.console import pluralize, progress, show
 from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Outcome, Row
+from experiments.runs.schema import is_ours
 from experiments.runs.version import code_version, describe_machine
 from experiments.sweeps.averages import RECORDING, averages
 from sim.errors import InputError, naming, printable, require
 from sim.files import write_text
-from sim.options import build, find, options
+from sim.options import build, options
 from sim.yaml_file import read_yaml
 
 BOARD = "board"  # column of the class of world
@@ -191,8 +191,6 @@ def _settings(folder: Path, submission: Submission) -> dict[str, Any]:
         settings["command"] = [
             str(f) if f.is_file() else w for f, w in zip(files, command, strict=True)
         ]
-        program = shutil.which(settings["command"][0])
-        require(program, f"{folder}: no program {printable(command[0])} that can be run")
     return settings
 
 
@@ -201,17 +199,9 @@ def _experiment(settings: dict[str, Any], submission: Submission, board: str) ->
     overrides = [f"study=board/{board}", f"prior.map={submission.map}"]
     experiment = Experiment.compose(overrides)
     return dataclasses.replace(
-        experiment.with_values(estimator=settings, isolated=not _is_program(settings)),
+        experiment.with_values(estimator=settings, isolated=not is_ours(settings)),
         choices={**experiment.choices, "estimator": submission.name},
     )
-
-
-def _is_program(settings: dict[str, Any]) -> bool:
-    target = str(settings["_target_"])
-    if not target.startswith("estimators.programs."):
-        return False
-    kind = find(target, "estimator")
-    return isinstance(kind, type) and issubclass(kind, ProgramOptions)
 
 
 def _checks(settings: dict[str, Any], submission: Submission) -> list[CheckResult]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from difflib import get_close_matches
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -179,6 +180,20 @@ def distinguishing_settings(table: pd.DataFrame) -> list[str]:
             kept.append(column)
             n_groups = finer
     return kept
+
+
+def describe_arm(row: pd.Series[Any], settings: Sequence[str]) -> str:
+    """What distinguishes a row, in words: the estimator's name, other settings with their keys."""
+    parts = [
+        str(row[name])
+        if name == "choice.estimator"
+        else f"{name.removeprefix('choice.')}={row[name]:g}"
+        if isinstance(row[name], float)
+        else f"{name.removeprefix('choice.')}={row[name]}"
+        for name in settings
+        if pd.notna(row[name])
+    ]
+    return ", ".join(parts)
 
 
 def suggest_axes(table: pd.DataFrame, taken: Sequence[str] = ()) -> list[str]:

@@ -30,7 +30,13 @@ from experiments.runs.paths import short
 from experiments.runs.row import Outcome
 from experiments.runs.store import read_runs
 from experiments.sweeps.averages import pool_repeats
-from experiments.sweeps.collect import DRAWN, distinguishing_settings, no_column, with_answers
+from experiments.sweeps.collect import (
+    DRAWN,
+    describe_arm,
+    distinguishing_settings,
+    no_column,
+    with_answers,
+)
 from experiments.sweeps.plan import Numbers, Plan
 from experiments.sweeps.summary import ERROR
 from sim.errors import InputError, require
@@ -327,10 +333,10 @@ class _Table:
         settings = distinguishing_settings(table.drop(columns=[*DRAWN], errors="ignore"))
         shared = [s for s in settings if (firsts.groupby("_recording")[s].nunique() < 2).all()]
         for _, rows in firsts.groupby("_recording"):
-            where = _called(rows.iloc[0], shared)
+            where = describe_arm(rows.iloc[0], shared)
             arms.setdefault(where, []).extend(rows.index.tolist())
             own = distinguishing_settings(rows.drop(columns=[*DRAWN, *shared], errors="ignore"))
-            names |= {arm: _called(row, own) for arm, row in rows.iterrows()}
+            names |= {arm: describe_arm(row, own) for arm, row in rows.iterrows()}
         return cls(
             np.log(values).unstack("_arm").sort_index(),
             arms,
@@ -343,20 +349,6 @@ class _Table:
         """Arm with the best mean over the seeds that all have."""
         means = self.logs[list(arms)].dropna().mean()
         return int(means.idxmin() if COLUMNS[metric].better == "lower" else means.idxmax())
-
-
-def _called(row: pd.Series[Any], settings: Sequence[str]) -> str:
-    """What distinguishes a row, in words: the estimator's name, other settings with their keys."""
-    parts = [
-        str(row[name])
-        if name == "choice.estimator"
-        else f"{name.removeprefix('choice.')}={row[name]:g}"
-        if isinstance(row[name], float)
-        else f"{name.removeprefix('choice.')}={row[name]}"
-        for name in settings
-        if pd.notna(row[name])
-    ]
-    return ", ".join(parts)
 
 
 def _best(history: Sequence[Comparison]) -> list[str]:

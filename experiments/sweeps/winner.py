@@ -8,18 +8,15 @@ from itertools import combinations
 
 import numpy as np
 import pandas as pd
-from scipy import stats
 
-from experiments.evaluation.statistics import holm
-from experiments.runs.columns import title
+from experiments.evaluation.statistics import holm, log_ratio_interval
 from experiments.runs.console import pluralize
 from experiments.runs.row import GAP, Outcome
-from experiments.sweeps.averages import RECORDING, difference_p, pool_repeats
-from experiments.sweeps.collect import DRAWN, distinguishing_settings, with_answers
+from experiments.sweeps.averages import MIN_UNITS, RECORDING, difference_p, pool_repeats
+from experiments.sweeps.collect import DRAWN, describe_arm, distinguishing_settings, with_answers
 from experiments.sweeps.summary import ERROR
 
 _LEVEL = 0.05  # of all tests together
-MIN_RECORDINGS = 3  # of a test
 _ARM, _BETWEEN, _ESTIMATOR = "arm", ", ", "choice.estimator"
 
 
@@ -84,7 +81,7 @@ class Winner:
         n = pluralize(self.n_recordings, "recording")
         if not self.rivals:
             return f"Over {n}; nothing to compare it with."
-        if self.n_recordings < MIN_RECORDINGS:
+        if self.n_recordings < MIN_UNITS:
             return f"Over {n}, too few for a test: more seeds would tell."
         all_pairs = " of all pairs" if len(self.rivals) > 1 else ""
         holm_s = " in all (Holm)" if all_pairs else ""
@@ -103,7 +100,7 @@ def find_winner(table: pd.DataFrame) -> Winner | None:
     arms = [_ESTIMATOR] if _ESTIMATOR in swept else swept
     if not arms or ERROR not in table:
         return None
-    table = table.assign(**{_ARM: _names(table, arms)})
+    table = table.assign(**{_ARM: [describe_arm(row, arms) for _, row in table.iterrows()]})
     whole, out = _whole(table)
     others = [name for name in swept if name not in arms]
     errors = pool_repeats(whole, [_ARM, RECORDING], ERROR, others).unstack(0).dropna()
@@ -111,9 +108,9 @@ def find_winner(table: pd.DataFrame) -> Winner | None:
         return None
     means = np.exp(np.log(errors).mean()).sort_values()
     best = str(means.index[0])
-    differ = _differing(errors) if len(errors) >= MIN_RECORDINGS else set()
+    differ = _differing(errors) if len(errors) >= MIN_UNITS else set()
     rivals = [
-        _rival(str(name), np.log(errors[name] / errors[best]), {best, str(name)} in differ)
+        _rival(str(name), errors[name], errors[best], {best, str(name)} in differ)
         for name in means.index[1:]
     ]
     return Winner(best, float(means.iloc[0]), len(errors), tuple(rivals), tuple(out))
@@ -127,23 +124,11 @@ def _differing(errors: pd.DataFrame) -> set[frozenset[str]]:
     return {frozenset(pair) for pair, is_one in zip(pairs, rejected, strict=True) if is_one}
 
 
-def _rival(name: str, logs: pd.Series[float], differs: bool) -> Rival:
-    n, mean = len(logs), float(logs.mean())
-    half = math.nan
-    if n >= MIN_RECORDINGS:
-        half = float(stats.t.ppf(0.975, n - 1) * logs.std() / math.sqrt(n))
-    return Rival(name, math.exp(mean), math.exp(mean - half), math.exp(mean + half), differs)
-
-
-def _names(table: pd.DataFrame, arms: list[str]) -> pd.Series[str]:
-    """What each run's arm is called."""
-    if arms == [_ESTIMATOR]:
-        return table[_ESTIMATOR].astype(str)
-    texts = [title(name) + " " + table[name].astype(str) for name in arms]
-    named = texts[0]
-    for text in texts[1:]:
-        named = named + _BETWEEN + text
-    return named
+def _rival(name: str, theirs: pd.Series[float], best: pd.Series[float], differs: bool) -> Rival:
+    found = log_ratio_interval(theirs, best)
+    if len(theirs) < MIN_UNITS:
+        return Rival(name, found.value, math.nan, math.nan, differs)
+    return Rival(name, found.value, found.low, found.high, differs)
 
 
 def _whole(table: pd.DataFrame) -> tuple[pd.DataFrame, list[str]]:

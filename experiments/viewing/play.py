@@ -20,7 +20,7 @@ from sim.formats.detect import read_all
 from sim.team import Team
 from sim.worlds.grid_file import read_grid
 
-MOST_PICTURES = 200  # a page of some 6 MB
+MOST_PICTURES = 200  # of a file: a page of 1 to 3 MB
 REAL_TIME_S = 70.0  # longest drive of which so many show three instants a second
 SECONDS = 20.0  # how long a longer drive plays
 

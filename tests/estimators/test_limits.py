@@ -56,7 +56,7 @@ def test_a_full_map_takes_no_more_landmarks(recording, association, monkeypatch)
         n = (15, 12, 25, 10, 10)[k]
         image = {
             "points_in_camera": rng.uniform([-3, -1, 1], [3, 1, 8], (n, 3)),
-            "ids": np.arange(n) + 100 * min(k, 3),  # the last image is of the one before
+            "ids": np.arange(n) + 100 * min(k, 3),  # the last image shows what the one before did
             "descriptors": np.zeros((n, 0), np.float32),
         }
         belief = estimator.step(fakes.with_reading(frame, "stereo", **image))

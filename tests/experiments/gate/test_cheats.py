@@ -66,9 +66,10 @@ class SearchesMemory(Base):
 class SearchesLogs(Base):
     def look(self, frame):
         found = [one for one in gc.get_objects() if type(one) is Recording]
-        # whatever their order, and however often each is in memory
+        # whatever their order, and however often each is in memory; without return, none counts
         scans = [one.log("laser")["ranges_m"] for one in found if "laser" in one.logs]
-        return sum({ranges_m[-1, ranges_m.shape[1] // 2] for ranges_m in scans})
+        ahead_m = {ranges_m[-1, ranges_m.shape[1] // 2] for ranges_m in scans}
+        return sum(one for one in ahead_m if np.isfinite(one))
 
 
 class ClimbsTheStack(Base):

@@ -270,7 +270,7 @@ def test_forward_slip_that_lasts_has_the_variance_of_its_formula(seed):
 
 
 def test_the_walls_of_a_laser_log_are_driven_through_nowhere(tmp_path):
-    """A twin of scans in a room: the error of its dead reckoning is of the log's size."""
+    """A twin of scans in a room: the error of its dead reckoning is as large as the log's."""
     drive = (
         "world=room sensors=real_laser robot=robocom simulation.physics=kinematic seed=2 "
         "robot.kr=1e-4 robot.kl=1e-4 sensors.laser.short_share=0.05 route.distance_m=45"

@@ -95,7 +95,7 @@ def test_published_geometry(run):
     }[run]
     np.testing.assert_allclose(found.values[:3], published, rtol=2e-3)
     blocks = [slip_of_turns(found, n, np.random.default_rng(0), 50) for n in (1, 8)]
-    # what neighbours share with opposite signs is no slip
+    # what neighbours share with opposite signs is not slip
     assert blocks[1].kr.high < blocks[0].kr.low / 2.0
     assert 1e-7 < blocks[1].kr.value < 2e-6
     assert 1e-7 < blocks[1].kl.value < 2e-6
