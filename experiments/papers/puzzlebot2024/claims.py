@@ -185,7 +185,7 @@ def pb4(coverage: pd.DataFrame, engine: pd.DataFrame, cases: pd.DataFrame) -> It
         worst = int(np.argmin([share.value for share in shares]))
         parts = [judge_interval(share, *_BAND) for share in shares]
         powers = [power_of(share, band=_BAND) for share in shares]
-        case = table.iloc[worst]["case"]
+        case, runs = table.iloc[worst]["case"], int(table.iloc[worst]["runs"])
         n_within = f"{parts.count(Verdict.REPRODUCED)} of {len(parts)}"
         claim = Claim(
             Subject("PB4", "ends in the ellipse", setting=float(k)),
@@ -196,8 +196,10 @@ def pb4(coverage: pd.DataFrame, engine: pd.DataFrame, cases: pd.DataFrame) -> It
             f"{n_within} manoeuvres within; the least in {case}",
             effect=EQUIVALENCE,
             power=min(powers),
-            facts={"case": case, "straight_m": length_m.get(case), "band": _BAND},
-        )
+            facts={
+                "case": case, "runs": runs, "straight_m": length_m.get(case), "band": _BAND,
+            },
+        )  # fmt: skip
         yield beside(claim, k > HELD_UP_TO_M * (1 + 1e-9))
         left += [k] if claim.verdict is Verdict.NOT_REPRODUCED else []
     label = "distance of PyBullet's end from the kinematic robot's, same noise, over the spread"

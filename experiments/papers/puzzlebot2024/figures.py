@@ -143,17 +143,20 @@ def _crossover(ax: Axes, crossover: pd.DataFrame, straight: Arrays) -> None:
 def calibration(table: pd.DataFrame) -> Figure:
     """Draw the estimates over the truth by method and wheel, their mean interval and coverage."""
     ks = sorted(table["k_m"].unique())
-    page, axes = subplots(9.0, 6.4, 2, len(ks), sharex=True, sharey=True)
+    known = table[table["method"].isin(list(_METHODS))]
+    arms = sorted({*zip(known["joint"], known["runs"], strict=True)})
+    page, axes = subplots(9.0, 3.2 * len(arms), len(arms), len(ks), sharex=True, sharey=True)
     rows = [(method, name) for method in _METHODS for name in _PARAMETERS]
-    for joint, line in zip((False, True), axes, strict=True):
+    for (joint, n), line in zip(arms, axes, strict=True):
+        of_arm = known[known["joint"].eq(joint) & known["runs"].eq(n)]
         for ax, k in zip(line, ks, strict=True):
             for i, (method, name) in enumerate(rows):
-                chosen = table["parameter"].eq(name) & table["method"].eq(method)
-                part = table[chosen & table["joint"].eq(joint) & table["k_m"].eq(k)]
+                chosen = of_arm["parameter"].eq(name) & of_arm["method"].eq(method)
+                part = of_arm[chosen & of_arm["k_m"].eq(k)]
                 _estimates(ax, part, len(rows) - 1 - i, CYCLE[i // 2])
             ax.axvline(1.0, color=BLACK, lw=0.8)
             arm = "gains and track estimated too" if joint else "nominal geometry"
-            ax.set_title(f"k = {k:g} m\n{arm}", fontsize="small")
+            ax.set_title(f"k = {k:g} m, {n:g} runs\n{arm}", fontsize="small")
     labels = [f"{_METHODS[method]}, {_PARAMETERS[name]}" for method, name in rows]
     ticks = {"yticks": range(len(rows)), "yticklabels": labels[::-1]}
     axes[0, 0].set(xscale="log", xlim=(0.55, 6.5), **ticks)
