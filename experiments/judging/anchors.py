@@ -1,6 +1,6 @@
 """Find a claim's anchor: where the reference arm has its printed level, on tuning seeds.
 
-python -m experiments.judging.anchors STUDY CLAIM [WORLDS]    # prints lines for findings.yaml
+python -m experiments.judging.anchors STUDY CLAIM [WORLDS]    # prints lines for design.yaml
 """
 
 import sys
@@ -19,7 +19,7 @@ Run = Callable[[Mapping[Any, Any], int], Row]
 
 
 def find(study: str, claim: str, n_worlds: int = 2, n_points: int = 64) -> list[str]:
-    """Lines for the findings: the anchor at each printed level of a claim, and its level.
+    """Lines for the design: the anchor at each printed level of a claim, and its level.
 
     The study's `reference_run` runs tuning seeds 0, 1, ...; a level is the geometric mean.
     """

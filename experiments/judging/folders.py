@@ -36,17 +36,30 @@ def findings(study: str) -> dict[str, Any]:
     """A study's findings in our words.
 
     They are its `title`, the paper's `source` and `doi`, `about`, `claims` and `sentences` by id,
-    those claims that are our `own` rather than the paper's, sequential `designs` by id, free
-    settings (`regions`) by id, when criteria changed (`criteria`) by id, and `figures` by file
-    name.
+    those claims that are our `own` rather than the paper's, when criteria changed (`criteria`) by
+    id, and `figures` by file name.
     """
-    path = code_folder(study) / "findings.yaml"
-    found = read_yaml(path) if path.exists() else {}
+    found = _read(study, "findings")
     empty = {"title": study, "claims": {}, "own": [], "sentences": {}, "figures": {}}
     empty |= dict.fromkeys(("about", "source", "doi"), "")
     whole = {**empty, **found}
-    pages = {f"{study}_region_{claim}": _region_page(claim) for claim in whole.get("regions", {})}
+    pages = {
+        f"{study}_region_{claim}": _region_page(claim) for claim in design(study).get("regions", {})
+    }
     return whole | {"figures": {**whole["figures"], **pages}}
+
+
+def design(study: str) -> dict[str, Any]:
+    """How a study's claims are judged: sequential `designs` and free settings (`regions`) by id.
+
+    Its rows depend on them, and not on the findings' words.
+    """
+    return _read(study, "design")
+
+
+def _read(study: str, name: str) -> dict[str, Any]:
+    path = code_folder(study) / f"{name}.yaml"
+    return read_yaml(path) if path.exists() else {}
 
 
 def _region_page(claim: str) -> dict[str, Any]:

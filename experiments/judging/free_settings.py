@@ -1,6 +1,6 @@
 """Settings that a paper leaves open: their plausible ranges, a sample of them, and the anchor.
 
-They stand in the study's findings.yaml beside the claims, fixed before the judged run:
+They stand in the study's design.yaml, fixed before the judged run:
 
     regions:
       MX1:
@@ -8,7 +8,7 @@ They stand in the study's findings.yaml beside the claims, fixed before the judg
         printed: # level of the reference arm, and where it comes out on tuning seeds
           Oxford: {column: oxford_m2_m, value: 9.61, anchor: {...}, level: 9.5}
         settings:
-          estimator.n_nearest: {low: 2, high: 20, scale: integer, source: "..."}
+          estimator.n_nearest: {words: B, low: 2, high: 20, scale: integer, source: "..."}
           estimator.noise_at: {choices: [measured, predicted], source: "..."}
       MX3: {like: MX1} # the same settings and runs
       MX9: {like: MX1, is_alone: true} # judged by its region alone, without an anchor
@@ -29,7 +29,7 @@ from numpy.typing import ArrayLike
 from scipy.stats import qmc
 
 from experiments.judging.claim import SMALLEST_EFFECT
-from experiments.judging.folders import findings
+from experiments.judging.folders import design
 from experiments.judging.surface import fit_surface
 from sim.arrays import Array
 from sim.errors import InputError, require
@@ -57,6 +57,8 @@ class Setting:
         Ends of the plausible range; of choices, the first and the last index.
     source
         Where the range comes from.
+    words
+        What sentences and figures call it, with its unit; empty: the name.
     """
 
     name: str
@@ -65,6 +67,12 @@ class Setting:
     high: float
     source: str
     choices: tuple[str | float | bool, ...] = ()
+    words: str = ""
+
+    @property
+    def called(self) -> str:
+        """Its name in sentences and figures."""
+        return self.words or self.name
 
     def at(self, units: ArrayLike) -> list[Any]:
         """Values at places (N,) in the range, each from 0 to 1."""
@@ -102,10 +110,18 @@ class Anchor:
     @property
     def words(self) -> str:
         """The settings in words."""
-        return ", ".join(
-            f"{name} = {value:.3g}" if isinstance(value, float) else f"{name} = {value}"
-            for name, value in self.settings.items()
-        )
+        return ", ".join(f"{name} = {_short(value)}" for name, value in self.settings.items())
+
+    def of(self, name: str) -> str:
+        """A setting's value in words; of several data sets, each one's."""
+        own = {
+            key.removeprefix(name): v for key, v in self.settings.items() if key.startswith(name)
+        }
+        return " and ".join(f"{_short(value)}{place}" for place, value in own.items())
+
+
+def _short(value: Any) -> str:
+    return f"{value:.3g}" if isinstance(value, float) else str(value)
 
 
 @dataclass(frozen=True)
@@ -171,18 +187,16 @@ class FreeSettings:
 
 
 def free_settings(study: str) -> dict[str, FreeSettings]:
-    """Return the free settings of a study's claims, by their ids, from its findings.yaml.
+    """Return the free settings of a study's claims, by their ids, from its design.yaml.
 
     Raises
     ------
     InputError
-        If they belong to no claim, or a range is empty, of an unknown scale, or without a source.
+        If a range is empty, of an unknown scale, or without a source.
     """
-    about = findings(study)
     found: dict[str, FreeSettings] = {}
-    for claim, given in about.get("regions", {}).items():
-        where = f"{study}/findings.yaml: regions.{claim}"
-        require(claim in about["claims"], f"{where}: no such claim")
+    for claim, given in design(study).get("regions", {}).items():
+        where = f"{study}/design.yaml: regions.{claim}"
         effect = number(given.get("effect", SMALLEST_EFFECT), f"{where}.effect")
         require(effect > 0.0, f"{where}.effect must be > 0")
         is_alone = bool(given.get("is_alone"))
@@ -218,6 +232,7 @@ def _setting(name: str, given: Any, where: str) -> Setting:
     require(isinstance(given, dict) and given.get("source"), f"{where}: needs a source")
     choices = tuple(given.get("choices", ()))
     low, high, source = 0.0, len(choices) - 1.0, str(given["source"])
+    words = str(given.get("words", ""))
     scale = Scale.CHOICE
     if not choices:
         low, high = (number(given.get(end), f"{where}.{end}") for end in ("low", "high"))
@@ -226,7 +241,7 @@ def _setting(name: str, given: Any, where: str) -> Setting:
         scale = Scale(given["scale"])
     require(low < high, f"{where}: low must be below high, or choices two or more")
     require(scale is not Scale.LOG or low > 0.0, f"{where}: a log scale needs low > 0")
-    return Setting(name, scale, low, high, source, choices)
+    return Setting(name, scale, low, high, source, choices, words)
 
 
 def table_at(settings: Sequence[Setting], units: Array) -> pd.DataFrame:

@@ -32,6 +32,7 @@ NOWHERE, EVERYWHERE, NONE_ALONE = (
     "everywhere in the region",
     "no single setting",
 )
+_CHOICES: Mapping[Any, str] = {True: "yes", False: "no"}
 _N_SHARE, _N_OTHERS, _N_LEVELS, _N_LINE = 1024, 64, 16, 201
 
 
@@ -93,31 +94,37 @@ class Region:
         Of the region, in which the claim holds by the smallest effect of interest.
     decided_by, boundary
         The setting that decides, and where the claim begins or ceases to hold along it, in words.
+    called
+        The setting's name in sentences; empty: as it is.
     """
 
     anchor: Anchor | None
     share: Interval
     decided_by: str
     boundary: str
+    called: str = ""
 
     def words(self, at_anchor: Verdict) -> str:
         """Say in how much of the region the claim holds, what decides, and where the paper lies."""
         ends = [f"{100.0 * v:.0f}" for v in (self.share.value, self.share.low, self.share.high)]
+        called = self.called or self.decided_by
         said = f"It holds in {ends[0]} % [{ends[1]}, {ends[2]}] of the region of free settings"
         if self.boundary in (NOWHERE, EVERYWHERE):
             pass
         elif self.decided_by == NONE_ALONE:
             said += ", and no single setting decides"
         else:
-            said += f"; {self.decided_by} decides: {self.boundary}"
+            said += f"; {called} decides: it {self.boundary}"
         if self.anchor is None:
             return f"{said}."
         printed = "where the printed level comes out"
         if not math.isfinite(self.anchor.level):
             printed = "the middle of the ranges, as no level is printed"
+        if at := self.anchor.of(self.decided_by):
+            printed += f" ({called}: {at})"
         lies = {Verdict.REPRODUCED: "it holds", Verdict.NOT_REPRODUCED: "it does not hold"}
         there = lies.get(at_anchor, "it is undecided")
-        return f"{said}. At the anchor ({self.anchor.words}), {printed}, {there}."
+        return f"{said}. At the anchor, {printed}, {there}."
 
 
 def fit(
@@ -216,7 +223,11 @@ def boundary_in_words(fitted: Fitted, i: int) -> str:
         line = np.full((len(setting.choices), len(fitted.settings)), 0.5)
         line[:, i] = setting.units(setting.choices)
         good = fitted.margins(snap(fitted.settings, line))[0] > 0.0
-        named = [str(c) for c, is_good in zip(setting.choices, good, strict=True) if is_good]
+        named = [
+            _CHOICES.get(c, str(c))
+            for c, is_good in zip(setting.choices, good, strict=True)
+            if is_good
+        ]
         return f"holds at {', '.join(named)}" if named else NOWHERE
     if stretch is None:
         return NOWHERE
@@ -240,7 +251,8 @@ def describe(fitted: Fitted, anchor: Anchor | None) -> Region:
         return Region(anchor, found, NONE_ALONE, at)
     if first is None:
         return Region(anchor, found, NONE_ALONE, "")
-    return Region(anchor, found, fitted.settings[first].name, boundary_in_words(fitted, first))
+    own = fitted.settings[first]
+    return Region(anchor, found, own.name, boundary_in_words(fitted, first), own.called)
 
 
 def rule(at_anchor: Verdict, found: Interval) -> Verdict:

@@ -49,7 +49,7 @@ def draw_region(
     for row, i in enumerate(reversed(order)):
         low, high = np.quantile(indices[1:, i], [0.025, 0.975])
         draw_interval(axes[2], row, Interval(indices[0, i], low, high), along="x", color=BLUE)
-    names = [literal(fitted.settings[i].name) for i in reversed(order)]
+    names = [literal(fitted.settings[i].called) for i in reversed(order)]
     axes[2].set_yticks(range(len(order)), names)
     axes[2].set(xlim=(-0.02, 1.02), xlabel="first-order index", title="What decides")
     return with_legend(page, 6, of=axes[0])
@@ -119,4 +119,4 @@ def _name_axis(ax: Axes, setting: Setting, axis: str) -> None:
         shares = setting.units(values)
     words = [f"{v:.2g}" if isinstance(v, float) else literal(str(v)) for v in values]
     named = {f"{axis}ticks": shares, f"{axis}ticklabels": words}
-    ax.set(**{f"{axis}label": literal(setting.name)}, **named)
+    ax.set(**{f"{axis}label": literal(setting.called)}, **named)

@@ -2,7 +2,7 @@
 
 A study's `region_run(name, values, seed, profile)` drives all arms at free settings in one world
 and returns their levels, which are columns of the table `region_NAME`. Claims with the same
-settings share it (`like` in the findings).
+settings share it (`like` in the design).
 """
 
 import math
@@ -29,7 +29,7 @@ from sim.errors import require
 Run = Callable[[str, Mapping[str, Any], int, Profile], Row]
 Job = tuple[Callable[..., Tables], Run, str, int, Mapping[str, Any], int, Profile]
 N_POINTS = {Profile.FULL: 64, Profile.QUICK: 16}
-N_WORLDS = {Profile.FULL: 6, Profile.QUICK: 2}  # at each point
+N_WORLDS = {Profile.FULL: 3, Profile.QUICK: 2}  # at each point
 _APART = {Profile.FULL: 1000, Profile.QUICK: 0}  # from the seeds of the worlds at the anchor
 _LEAST_POINTS = 8
 
@@ -74,14 +74,13 @@ Headlines = Mapping[str, Sequence[Compared]]  # by the claim's id
 
 def region_jobs(study: str, run: Run, profile: Profile) -> list[Job]:
     """The calls that make the tables of a study's regions, for `operator.call`."""
-    n_worlds = N_WORLDS[profile]
     first = FIRST_SEED[profile] + _APART[profile]
     return [
-        (_region_row, run, name, point, values, first + n_worlds * point + world, profile)
+        (_region_row, run, name, point, values, first + N_POINTS[profile] * world + point, profile)
         for name, free in free_settings(study).items()
         if free.runs == name
+        for world in range(N_WORLDS[profile])  # further ones leave the seeds of these as they are
         for point, values in enumerate(_points(study, name, free, profile))
-        for world in range(n_worlds)
     ]
 
 

@@ -1,6 +1,6 @@
 """Claims that stop as soon as they are decided: their designs, their judgement, and the blocks.
 
-A design stands in the study's findings.yaml before its judged run: the smallest effect of interest,
+A design stands in the study's design.yaml before its judged run: the smallest effect of interest,
 the spread that it was planned from, and the looks, of which the last is the most recordings. At
 every look the claim is decided, or shown to be within its margin, or goes on; at the last it is
 capped, and states the power that it had. `experiments.evaluation.sequential` holds the error over
@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 
 from experiments.evaluation.sequential import SPENT, look_errors, power_at, repeated_interval
 from experiments.evaluation.statistics import Interval, log_ratios
+from experiments.judging import folders
 from experiments.judging.claim import (
     EQUIVALENCE,
     SMALLEST_EFFECT,
@@ -29,7 +30,6 @@ from experiments.judging.claim import (
     judge_interval,
     power_of,
 )
-from experiments.judging.folders import findings
 from experiments.judging.results import FIRST_SEED, Profile
 from sim.errors import InputError, require
 
@@ -63,18 +63,16 @@ class Design:
 
 
 def designs(study: str) -> dict[str, Design]:
-    """Return the sequential designs of a study's claims, by their ids, from its findings.yaml.
+    """Return the sequential designs of a study's claims, by their ids, from its design.yaml.
 
     Raises
     ------
     InputError
-        If one belongs to no claim, lacks a number, or its looks do not increase.
+        If one lacks a number, or its looks do not increase.
     """
-    about = findings(study)
     found = {}
-    for name, given in about.get("designs", {}).items():
-        where = f"{study}/findings.yaml: designs.{name}"
-        require(name in about["claims"], f"{where}: no such claim")
+    for name, given in folders.design(study).get("designs", {}).items():
+        where = f"{study}/design.yaml: designs.{name}"
         try:
             design = Design(float(given["spread"]), tuple(given["looks"]), float(given["effect"]))
             look_errors(design.looks)

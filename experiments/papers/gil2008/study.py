@@ -160,16 +160,13 @@ def region_run(name: str, values: Mapping[str, Any], seed: int, profile: Profile
     given = [f"seed={seed}", *overrides_at(values), *short]
     if name == "GI7":
         return _association_levels(given, seed)
-    lines = ["study=gil2008", "estimator=fastslam_paper", *given]
-    recording = whole(Experiment.compose(lines))
-    row, fewer = _odometry(Experiment.compose(lines), recording), settings.FEWER[profile]
+    base = Experiment.compose(["study=gil2008", "estimator=fastslam_paper", *given])
+    recording, fewer = whole(base), settings.FEWER[profile]
+    row = _odometry(base, recording)
     for n, far_m in settings.REGION_ARMS:
-        keys = [
-            f"estimator.n_particles={fewer.get(n, n)}",
-            f"sensors.stereo.max_distance_m={far_m}",
-        ]
-        one, label = Experiment.compose([*lines, *keys]), f"m{n}_{far_m}m"
-        row |= _levels(one, recording, label, stream(seed, "estimator/region"))
+        keys = ("estimator", "n_particles"), ("sensors", "stereo", "max_distance_m")
+        one = base.with_leaves(zip(keys, (fewer.get(n, n), float(far_m)), strict=True))
+        row |= _levels(one, recording, f"m{n}_{far_m}m", stream(seed, "estimator/region"))
     return row
 
 

@@ -179,7 +179,8 @@ def mx9(weighting: pd.DataFrame) -> Iterator[Claim]:
     for name in geometries(own):
         part = own[own["geometry"] == name].groupby("seed")[["error_m", "nearest_node_m"]].mean()
         found = log_ratio_interval(part["error_m"], part["nearest_node_m"])
-        about = Subject("MX9", "error", over="nearest node", place=NAMES[name])
+        arm = "data set" if name in headlines(own["geometry"]) else "control"
+        about = Subject("MX9", "error", over="nearest node", place=NAMES[name], arm=arm)
         yield shown(
             about, f"error of M2 over the distance to the nearest node, {NAMES[name]}", found
         )

@@ -1,7 +1,7 @@
 """The study of maximo2024: weightings M1-M3, particles, starts, kidnapping, clouds of a campus.
 
 The route is the unit of inference. Each world is a route, or the real Oxford positions, with
-queries and descriptors of its own. Parameters are those of the anchor (findings.yaml, `regions`).
+queries and descriptors of its own. Parameters are those of the anchor (design.yaml, `regions`).
 """
 
 import math

@@ -118,7 +118,7 @@ def anchored(name: str) -> Mapping[str, Any]:
     """The free settings at the anchor of a geometry; of a campus, UMH's."""
     place = PLACES.get(name.removesuffix("_plane"), "UMH")
     at = free_settings("maximo2024")["MX1"].printed[place].anchor
-    require(at is not None, f"maximo2024/findings.yaml: MX1 has no anchor on {place}")
+    require(at is not None, f"maximo2024/design.yaml: MX1 has no anchor on {place}")
     return cast(Anchor, at).settings
 
 

@@ -180,7 +180,7 @@ def test_pb4_names_the_k_at_which_the_band_is_left():
     early = coverage.assign(k_m=coverage["k_m"] / 10.0)
     said = concluded("puzzlebot2024", claims.pb4(early, ends(0.0), cases))
     assert said.verdict == "not_reproduced"
-    assert said.sentence.startswith("A straight of 2.5 m bends the cloud")
+    assert said.sentence.startswith("On a simulated straight of 2.5 m the ideal robot")
 
 
 def ends(gap_m):

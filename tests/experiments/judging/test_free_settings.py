@@ -38,9 +38,9 @@ def given(**changes):
     return {"settings": {"k": {name: v for name, v in setting.items() if v is not None}}}
 
 
-def test_free_settings_stand_in_the_findings(monkeypatch):
-    about = {"claims": {"X1": "says"}, "regions": {"X1": {**given(low="1e-3"), "effect": 0.2}}}
-    monkeypatch.setattr(free, "findings", lambda study: about)
+def test_free_settings_stand_in_the_design(monkeypatch):
+    about = {"regions": {"X1": {**given(low="1e-3"), "effect": 0.2}}}
+    monkeypatch.setattr(free, "design", lambda study: about)
     (found,) = free.free_settings("s")["X1"].settings
     assert found == Setting("k", Scale.LOG, 1e-3, 2.0, "a data sheet")
     assert free.free_settings("s")["X1"].effect == 0.2
@@ -52,7 +52,6 @@ def test_free_settings_stand_in_the_findings(monkeypatch):
 @pytest.mark.parametrize(
     ("claim", "of", "wrong"),
     [
-        ("X2", given(), "regions.X2: no such claim"),
         ("X1", {}, "regions.X1: needs settings"),
         ("X1", given(source=None), "settings.k: needs a source"),
         ("X1", given(low=3), "low must be below high"),
@@ -64,11 +63,11 @@ def test_free_settings_stand_in_the_findings(monkeypatch):
     ],
 )
 def test_wrong_free_settings_are_refused(monkeypatch, claim, of, wrong):
-    about = {"claims": {"X1": "says"}, "regions": {claim: of}}
-    monkeypatch.setattr(free, "findings", lambda study: about)
+    about = {"regions": {claim: of}}
+    monkeypatch.setattr(free, "design", lambda study: about)
     with pytest.raises(InputError, match=wrong) as refused:
         free.free_settings("s")
-    assert str(refused.value).startswith("s/findings.yaml: ")
+    assert str(refused.value).startswith("s/design.yaml: ")
 
 
 def test_a_surface_follows_a_step_through_noise_and_ignores_what_does_nothing():

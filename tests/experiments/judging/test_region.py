@@ -189,8 +189,8 @@ def test_the_boundary_is_said_in_the_settings_own_numbers():
     assert region.decided_by == "robot.kr"
     assert region.boundary.startswith("holds below 0.0001 [")
     said = region.words(FAILS)
-    assert "robot.kr decides: holds below 0.0001 [" in said
-    assert said.endswith("as no level is printed, it does not hold.")
+    assert "robot.kr decides: it holds below 0.0001 [" in said
+    assert said.endswith("as no level is printed (robot.kr: 0.0001), it does not hold.")
     chosen = planted(lambda u: u[:, 1] - 0.5 - NEED, 8, 0.1, settings=settings)[0]
     assert boundary_in_words(chosen, 1) == "holds at measured"
     above = planted(lambda u: stepped(1.0 - u[:, ::-1]), 9, 0.1, settings=settings)[0]
@@ -206,7 +206,8 @@ def test_a_verdict_by_region_is_written_and_read(tmp_path):
     said = {"sentences": {"X1": "It is {{ rows[0].found|plain }}."}}
     (ruled,) = conclude([found], said, {"X1": region})
     assert (ruled.verdict, ruled.at_anchor) == (Verdict.DEPENDS, HOLDS)
-    assert "k decides: holds below 0.7" in ruled.sentence
+    assert "k decides: it holds below 0.7" in ruled.sentence
+    assert "where the printed level comes out (k: 0.5), it holds." in ruled.sentence
     (alone,) = conclude([dataclasses.replace(found, role=Role.BESIDE)], said, {"X1": region})
     assert (alone.verdict, alone.at_anchor) == (Verdict.DEPENDS, ALONE)
     path = tmp_path / "verdicts.csv"

@@ -63,12 +63,10 @@ def test_designs_of_all_studies_are_sound():
         ({"X1": {"spread": 0.1, "effect": 0.1}}, "designs.X1: needs spread, looks and effect"),
         ({"X1": {"spread": 0.1, "effect": 0.1, "looks": [40, 20]}}, "must increase"),
         ({"X1": {"spread": 0.0, "effect": 0.1, "looks": [40]}}, "must be > 0"),
-        ({"X2": {"spread": 0.1, "effect": 0.1, "looks": [40]}}, "designs.X2: no such claim"),
     ],
 )
 def test_a_wrong_design_is_named(monkeypatch, given, complaint):
-    about = {"claims": {"X1": "It says."}, "designs": given}
-    monkeypatch.setattr(sequential, "findings", lambda _: about)
+    monkeypatch.setattr(sequential.folders, "design", lambda _: {"designs": given})
     with pytest.raises(InputError, match=complaint):
         designs("paper")
 
