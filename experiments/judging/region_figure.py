@@ -105,9 +105,13 @@ def _draw_line(
         ax.axvline(place[i], color=BLUE, lw=0.8, ls=":", label="anchor")
     _name_axis(ax, fitted.settings[i], "x")
     ax.set(xlim=(0.0, 1.0), yscale="log", title="Its ratio")
-    plain_log(ax.yaxis, (1.0, 1.2, 1.5, 2.0, 3.0, 5.0, 7.0))
+    bottom, top = ax.get_ylim()
+    is_wide = top > 2.0 * bottom
+    plain_log(
+        ax.yaxis, (1.0, 1.2, 1.5, 2.0, 3.0, 5.0, 7.0) if is_wide else (1.0, 1.1, 1.2, 8.0, 9.0)
+    )
     named = dict(zip(*ax.get_legend_handles_labels()[::-1], strict=True))  # a label once
-    ax.legend(named.values(), named.keys(), fontsize=8)
+    ax.legend(named.values(), named.keys(), fontsize=8, framealpha=0.9)
 
 
 def _name_axis(ax: Axes, setting: Setting, axis: str) -> None:

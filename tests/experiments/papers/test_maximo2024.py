@@ -161,7 +161,10 @@ def test_mx3_judges_every_weighting():
     assert list(claims.mx3(spread.assign(step=9))) == []
     slow = weighting(1.0, 1.5, 2.0, column="dispersion_m").assign(step=10)
     assert headlines(claims.mx3(slow)) == ["not_reproduced", "not_reproduced"]
-    assert ", and 0.2 [0.2, 0.2] times as far by M3 as by M1" in concluded("maximo2024", claims.mx3(spread)).sentence
+    assert (
+        ", and 0.2 [0.2, 0.2] times as far by M3 as by M1"
+        in concluded("maximo2024", claims.mx3(spread)).sentence
+    )
 
 
 def test_mx4_follows_its_tables():
