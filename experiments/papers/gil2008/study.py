@@ -76,7 +76,7 @@ def run(profile: Profile, out: Results, on_progress: Progress) -> None:
             partial(_judged, name),
         )  # fmt: skip
     on_progress(0.9)
-    out.write_tables(**tables, cost=cost_by_landmarks(settings.N_TIMINGS[profile]))
+    out.write_tables(**tables, cost=cost_by_landmarks(settings.N_TIMINGS[profile], 2))
     write_arrays(out)
     on_progress(1.0)
 
