@@ -10,7 +10,7 @@ import operator
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from itertools import accumulate
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -134,8 +134,8 @@ def plan_table(
     n_draws, n_repeats = settings.N_DRAWS[profile], settings.N_REPEATS[profile]
     if seeds is None and profile is Profile.QUICK:
         seeds = range(settings.N_QUICK)
-    one_world = table == "repeats" or seeds is None
-    given = [] if one_world else [f"seed={','.join(map(str, cast(Sequence[int], seeds)))}"]
+    worlds = [] if seeds is None else seeds[:1] if table == "repeats" else seeds
+    given = [f"seed={','.join(map(str, worlds))}"] if worlds else []
     for one in plan_experiments([f"study=gil2008/{table}", *given]):
         drawn = one.options_of("recording")
         if drawn["draw"] < n_draws and drawn["image_draw"] <= n_repeats:
