@@ -13,6 +13,11 @@ from experiments.viewing.style import BLACK, BLUE, ORANGE, WALL, subplots
 from sim.arrays import Array
 
 _N_GRID = 81
+_TICKS = {  # by the ratio of an axis' ends
+    2.0: (1.0, 1.1, 1.2, 8.0, 9.0),
+    15.0: (1.0, 1.2, 1.5, 2.0, 3.0, 5.0, 7.0),
+    np.inf: (1.0, 2.0, 5.0),
+}
 _HOLDS, _FAILS = "#9BD0A5", "#F2B48C"
 
 
@@ -106,10 +111,7 @@ def _draw_line(
     _name_axis(ax, fitted.settings[i], "x")
     ax.set(xlim=(0.0, 1.0), yscale="log", title="Its ratio")
     bottom, top = ax.get_ylim()
-    is_wide = top > 2.0 * bottom
-    plain_log(
-        ax.yaxis, (1.0, 1.2, 1.5, 2.0, 3.0, 5.0, 7.0) if is_wide else (1.0, 1.1, 1.2, 8.0, 9.0)
-    )
+    plain_log(ax.yaxis, next(each for most, each in _TICKS.items() if top < most * bottom))
     named = dict(zip(*ax.get_legend_handles_labels()[::-1], strict=True))  # a label once
     ax.legend(named.values(), named.keys(), fontsize=8, framealpha=0.9)
 
