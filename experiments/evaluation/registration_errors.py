@@ -70,7 +70,7 @@ def measure(
     Parameters
     ----------
     n_repeats, n_sampled
-        Pairs of noisy scans; those of them for which the covariance by sampling is computed.
+        Pairs of noisy scans; how many of those that register have the covariance by sampling too.
     """
     bearings, sigma = laser.bearings_rad, laser.sigma_range_m
     truth = se2.between(scene.T_w_target, scene.T_w_source)
@@ -78,7 +78,7 @@ def measure(
     clean = [cast(scene.walls, pose, bearings)[0] for pose in (scene.T_w_target, scene.T_w_source)]
     matches: dict[Metric, list[tuple[float, ...]]] = {metric: [] for metric in metrics}
     tried: dict[tuple[Metric, str], list[tuple[float, ...]]] = {}
-    for repeat in range(n_repeats):
+    for _ in range(n_repeats):
         noisy = [ranges + sigma * rng.standard_normal(len(ranges)) for ranges in clean]
         target, source = (prepare(ranges, bearings, laser.max_range_m) for ranges in noisy)
         guess = truth + _GUESS_SIGMA * rng.standard_normal(3)
@@ -94,7 +94,7 @@ def measure(
             if found.status in ("empty", "poor_overlap", "not_converged"):
                 continue
             for name, method in _methods(sigma, rng).items():
-                if name == "sampling" and repeat >= n_sampled:
+                if name == "sampling" and len(tried.get((metric, name), ())) == n_sampled:
                     continue
                 begun = time.perf_counter()
                 covariance = method(found, source, target)

@@ -70,10 +70,13 @@ def covariance_levels(values: Mapping[str, Any], seed: int, n_repeats: int) -> R
     rules = Rules(neighbours=int(values["estimator.neighbours"]))
     sigma = f"sensors.laser.sigma_range_m={values['sensors.laser.sigma_range_m']}"
     made = covariances_of(seed, values["place"], n_repeats, sigma, rules=rules, **given)
-    rows = pd.DataFrame(made["covariances"]).set_index("method")
+    methods = ("hessian_points", "censi_last", "sampling")
+    columns = ["method", "nees_over_dof", "time_us"]
+    # NaN if no pair registers
+    rows = pd.DataFrame(made["covariances"], columns=columns).set_index("method").reindex(methods)
     return {
         f"{method}_{key}": float(np.exp(abs(np.log(value)))) if key == "off" else float(value)
-        for method in ("hessian_points", "censi_last", "sampling")
+        for method in methods
         for key, value in (
             ("off", rows.loc[method, "nees_over_dof"]), ("time_us", rows.loc[method, "time_us"])
         )

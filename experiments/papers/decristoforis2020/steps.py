@@ -158,7 +158,7 @@ def ellipse_summary(path: pd.DataFrame) -> Row:
         smooth = inside["long_m"].rolling(5, center=True, min_periods=1).median()
         # the mean direction of axes, which are the same when they are turned by pi
         straight = 0.5 * np.angle(np.mean(np.exp(2j * before["direction_rad"])))
-        turned = inside["direction_rad"][smooth.idxmax()] - straight
+        turned = inside["direction_rad"][smooth.idxmax()] - straight if len(inside) else math.nan
         row |= {
             f"long_before_{bend}_m": float(before["long_m"].median()),
             f"long_in_{bend}_m": float(smooth.max()),

@@ -7,6 +7,7 @@ import pytest
 from experiments.evaluation.registration_errors import METRICS
 from experiments.judging.claim import select_all
 from experiments.papers.decristoforis2020 import claims
+from experiments.papers.decristoforis2020 import pairs as of_pairs
 from tests.fixtures.claims import concluded
 
 SEEDS = np.arange(1000, 1020)
@@ -250,3 +251,21 @@ def test_every_claim_names_its_criterion():
         assert claim.criterion
         assert claim.found.low <= claim.found.value <= claim.found.high
     assert next(claims.dc2(ellipses())).found.value == pytest.approx(8.0, rel=0.1)
+
+
+def test_scans_that_do_not_register_leave_the_levels_empty(monkeypatch):
+    rows = [{"method": m, "nees_over_dof": 2.0, "time_us": 5.0} for m in ("censi_last", "sampling")]
+    values = {
+        "estimator.metric": "point_to_plane",
+        "estimator.neighbours": 6,
+        "sensors.laser.sigma_range_m": 0.04,
+        "place": "room",
+    }
+    for table in (pd.DataFrame(rows), pd.DataFrame()):
+        monkeypatch.setattr(
+            of_pairs, "covariances_of", lambda *_, _t=table, **__: {"covariances": _t}
+        )
+        levels = of_pairs.covariance_levels(values, 0, 4)
+        assert levels["sampling_off"] == pytest.approx(2.0) or not len(table)
+        assert np.isnan(levels["hessian_points_off"])
+        assert np.isnan(levels["hessian_points_time_us"])
