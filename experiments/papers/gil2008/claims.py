@@ -250,7 +250,7 @@ def _one_drive(repeats: pd.DataFrame) -> Claim:
     said = (
         f"The paper's own design, one drive with {len(some)} runs, shows a ratio of "
         f"{found.value:.3g} with p = {p:.2g}: it sees "
-        f"{'a gain' if p < 0.05 else 'no gain, as it is too small to'}."
+        f"{'a gain' if p < 0.05 else 'no gain, being too small to show one'}."
     )
     about = Subject("GI3", OWN_DESIGN, arm="one drive")
     return shown(about, "position error, M = 200 over M = 1000, one drive", found, said, p=p)
