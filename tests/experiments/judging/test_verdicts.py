@@ -209,7 +209,8 @@ def test_every_claim_has_one_verdict_and_a_plain_sentence(tracked):
     for each in conclusions:
         own = [c for c in claims if c.id == each.id]
         waits = [c for c in own if c.about.quantity == WAITS]
-        assert waits or [c for c in own if c.role is Role.HEADLINE], each.id
+        has_headline = any(c.role is Role.HEADLINE for c in own)
+        assert waits or has_headline or each.region, each.id  # MX9 is judged by its region alone
         assert (each.sentence == WAITING) == bool(waits)
         assert each.sentence.endswith(".")
         assert "nan" not in each.sentence
