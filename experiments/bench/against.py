@@ -3,11 +3,12 @@
 Times of different days differ by more than most changes do, and those of one process and the next
 by percents, since code and data come to lie elsewhere in memory. So a second checkout of the code,
 at an earlier revision, runs in turn with the code as it is: in each of ROUNDS, a process of either
-answers in turn, and the median of the turns' ratios counts.
+answers in turn, the more often the noisier the machine is, and the median of the turns' ratios counts.
 """
 
 import dataclasses
 import json
+import math
 import os
 import shutil
 import statistics
@@ -30,7 +31,9 @@ from experiments.runs.console import warn
 from sim.errors import InputError, require, required
 
 ROUNDS = 5  # of fresh processes
-_ROUND_S = 4.0  # of turns at one item, at least one turn
+_TURNS = range(6, 41)  # of a round, as many as the noise asks for;
+_SURE = 0.02  # until the medians have this standard error, as a share,
+_ROUND_S = 20.0  # or this time is up
 _LOCK = "requirements.lock"  # of the environment
 _WALL = ("compile", "external", "sweep", "sweep_scale")  # their children do the work
 _BENCH = """
@@ -236,15 +239,23 @@ def alternate(
 def _turns(item: str, now: Ask, before: Ask, first: int) -> dict[str, list[float]]:
     """Ratios of each figure by turns: who comes first changes, so that no drift favours either."""
     ratios: dict[str, list[float]] = {}
-    turn, until = first, time.monotonic() + _ROUND_S
-    while turn == first or (ratios and time.monotonic() < until):
+    until = math.inf  # the first turn may have to compile
+    for turn in range(first, first + _TURNS.stop - 1):
         order = (now, before) if turn % 2 else (before, now)
         given = {ask: ask(item) for ask in order}
         for name, value in given[now].items():
             if value > 0.0 and given[before].get(name, 0.0) > 0.0:
                 ratios.setdefault(name, []).append(value / given[before][name])
-        turn += 1
+        until = min(until, time.monotonic() + _ROUND_S)
+        if time.monotonic() >= until or all(map(_is_sure, ratios.values())):
+            break
     return ratios
+
+
+def _is_sure(ratios: Sequence[float]) -> bool:
+    """Whether their median has a small standard error, taken from the deviations' median."""
+    away = float(np.median(np.abs(np.array(ratios) - np.median(ratios))))
+    return len(ratios) >= _TURNS.start and 1.86 * away / math.sqrt(len(ratios)) < _SURE
 
 
 def run_against(
