@@ -1,9 +1,8 @@
 """Old and new code in alternation, in the same minutes on one core: ratios, with intervals.
 
-Times of different days differ by more than most changes do, and those of one process and the next
-by percents, since code and data come to lie elsewhere in memory. So a second checkout of the code,
-at an earlier revision, runs in turn with the code as it is: in each of ROUNDS, a process of either
-answers in turn, the more often the noisier the machine is, and the median of the turns' ratios counts.
+Times of different days differ by more than most changes do. So a second checkout of the code, at
+an earlier revision, runs in turn with the code as it is: in each of ROUNDS, a process of either
+answers in turn, the more often the noisier the machine, and the median of the turns' ratios counts.
 """
 
 import dataclasses
@@ -45,9 +44,10 @@ def answer(name):
     return json.loads(run_bench(name, as_json=True))["results"]
 """
 # What a script answers goes out alone: what else the code prints is no answer
-_SERVE = """
+_SERVED = """
 import json, sys
 out, sys.stdout = sys.stdout, sys.stderr
+{}
 for line in sys.stdin:
     print(json.dumps(answer(line.strip())), file=out, flush=True)
 """
@@ -170,7 +170,7 @@ def serving(script: str, arguments: Sequence[str], folder: Path) -> Iterator[Ask
     """
     with tempfile.TemporaryFile("w+") as errors:
         child = subprocess.Popen(
-            **_command(folder, script + _SERVE, *arguments),
+            **_command(folder, _SERVED.format(script), *arguments),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=errors,
@@ -184,6 +184,7 @@ def serving(script: str, arguments: Sequence[str], folder: Path) -> Iterator[Ask
                 print(item, file=asked, flush=True)
                 return json.loads(answered.readline())
             except (OSError, ValueError):
+                child.kill()
                 child.wait()
                 errors.seek(0)
                 why = _why(errors.read(), child.returncode)
