@@ -1,8 +1,9 @@
 """Old and new code in alternation, in the same minutes on one core: ratios, with intervals.
 
-Times of different days differ by more than most changes do. So a second checkout of the code, at
-an earlier revision, runs in turn with the code as it is: in each of ROUNDS, a process of either
-answers in turn, the more often the noisier the machine, and the median of the turns' ratios counts.
+Times of different days differ by more than most changes do, and on a busy machine so do those of
+one tenth of a second and the next. So a second checkout of the code, at an earlier revision, runs
+in turn with the code as it is. In each of ROUNDS, a process of either is asked for the same, and
+they take turns every few milliseconds, wherever the code looks at the clock.
 """
 
 import dataclasses
@@ -30,25 +31,37 @@ from experiments.runs.console import warn
 from sim.errors import InputError, require, required
 
 ROUNDS = 5  # of fresh processes
+_SLICE_S = 0.003  # of processor time, after which a process lets the other one run
 _TURNS = range(6, 41)  # of a round, as many as the noise asks for;
-_SURE = 0.02  # until the medians have this standard error, as a share,
+_SURE = 0.015  # until the medians have this standard error, as a share,
 _ROUND_S = 20.0  # or this time is up
 _LOCK = "requirements.lock"  # of the environment
 _WALL = ("compile", "external", "sweep", "sweep_scale")  # their children do the work
 _BENCH = """
-import json, sys, time
-if sys.argv[1] == "processor":
-    time.perf_counter = time.process_time
 from experiments.bench import run_bench
 def answer(name):
     return json.loads(run_bench(name, as_json=True))["results"]
 """
-# What a script answers goes out alone: what else the code prints is no answer
+# The clocks give processor time. Where they are read, a process that has run for a while answers
+# null, and waits until it is asked again; what that takes does not count. What else the code prints
+# is no answer.
 _SERVED = """
-import json, sys
+import json, sys, threading, time
 out, sys.stdout = sys.stdout, sys.stderr
-{}
-for line in sys.stdin:
+own, lost_s, last_s, main = time.process_time, 0.0, 0.0, threading.get_ident()
+def processor_s():
+    global lost_s, last_s
+    now_s, before_s = own(), lost_s
+    if now_s - last_s > {slice_s} and threading.get_ident() == main:
+        print("null", file=out, flush=True)
+        sys.stdin.readline()
+        last_s = own()
+        lost_s += last_s - now_s
+    return now_s - before_s
+if {slice_s}:
+    time.process_time = time.perf_counter = processor_s
+{script}
+for line in iter(sys.stdin.readline, ""):
     print(json.dumps(answer(line.strip())), file=out, flush=True)
 """
 Ask = Callable[[str], Any]
@@ -155,13 +168,20 @@ def run_in(folder: Path, script: str, *arguments: str) -> Any:
 
 
 @contextmanager
-def serving(script: str, arguments: Sequence[str], folder: Path) -> Iterator[Ask]:
+def serving(
+    script: str, arguments: Sequence[str], folder: Path, slice_s: float = _SLICE_S
+) -> Iterator[Ask]:
     """A process with the code of a folder, which is asked for one item after the other.
+
+    It answers None where the other process should run for a while; ask again.
 
     Parameters
     ----------
     script
-        Defines `answer`, a function of the item that returns what JSON can hold.
+        Defines `answer`, a function of the item that returns what JSON can hold, by the clocks
+        of processor time.
+    slice_s
+        Processor time between such answers; 0: none, and the clocks are those of the system.
 
     Raises
     ------
@@ -170,7 +190,7 @@ def serving(script: str, arguments: Sequence[str], folder: Path) -> Iterator[Ask
     """
     with tempfile.TemporaryFile("w+") as errors:
         child = subprocess.Popen(
-            **_command(folder, _SERVED.format(script), *arguments),
+            **_command(folder, _SERVED.format(script=script, slice_s=slice_s), *arguments),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=errors,
@@ -223,7 +243,8 @@ def alternate(
     Parameters
     ----------
     start
-        Starts a process with the code of a folder, which answers an item with its figures.
+        Starts a process with the code of a folder, which answers an item with its figures, or
+        with None where the other should run for a while.
     """
     rounds: dict[str, list[float]] = {}
     with on_one_core():
@@ -242,8 +263,11 @@ def _turns(item: str, now: Ask, before: Ask, first: int) -> dict[str, list[float
     ratios: dict[str, list[float]] = {}
     until = math.inf  # the first turn may have to compile
     for turn in range(first, first + _TURNS.stop - 1):
-        order = (now, before) if turn % 2 else (before, now)
-        given = {ask: ask(item) for ask in order}
+        given: dict[Ask, Mapping[str, float]] = {}
+        waiting = [now, before] if turn % 2 else [before, now]
+        while waiting:
+            given |= {ask: found for ask in waiting if (found := ask(item)) is not None}
+            waiting = [ask for ask in waiting if ask not in given]
         for name, value in given[now].items():
             if value > 0.0 and given[before].get(name, 0.0) > 0.0:
                 ratios.setdefault(name, []).append(value / given[before][name])
@@ -263,16 +287,18 @@ def run_against(
     name: str, revision: str, on_progress: Callable[[float], None] = lambda _: None
 ) -> list[Measurement]:
     """A suite's last measurements of the code as it is, with their ratios to a revision's."""
-    old, clock = checkout(revision), "wall" if name in _WALL else "processor"
+    old, slice_s = checkout(revision), 0.0 if name in _WALL else _SLICE_S
     last: Sequence[Mapping[str, Any]] = ()
 
     @contextmanager
     def start(folder: Path) -> Iterator[Ask]:
-        with serving(_BENCH, [clock], folder) as ask:
+        with serving(_BENCH, [], folder, slice_s) as ask:
 
-            def figures(item: str) -> dict[str, float]:
+            def figures(item: str) -> dict[str, float] | None:
                 nonlocal last
                 results = ask(item)
+                if results is None:
+                    return None
                 if folder == paths.SOURCE:
                     last = results
                 return {result["name"]: result["value"] for result in results}

@@ -91,6 +91,27 @@ def test_the_order_turns_and_noise_takes_more_turns():
     assert counted(1.0)[0] == against.ROUNDS * (against._TURNS.stop - 1)
 
 
+def test_processes_take_turns_wherever_they_look_at_the_clock(repository):
+    script = """
+def answer(item):
+    begun, n = time.process_time(), 0
+    while (past := time.perf_counter() - begun) < 0.05:
+        n += 1
+    return past
+"""
+    with serving(script, [], repository) as one, serving(script, [], repository) as other:
+        for _ in range(2):
+            given = [ask("x") for _ in range(10) for ask in (one, other)]
+            assert given == [None] * 20  # 17 slices of 3 ms, and both are under way
+            while (last := one("x")) is None:
+                pass
+            assert 0.05 <= last < 0.1  # what waiting takes does not count
+            while other("x") is None:
+                pass
+    with serving(script, [], repository, 0.0) as alone:
+        assert alone("x") >= 0.05
+
+
 def test_a_long_suite_takes_one_turn_a_round(monkeypatch):
     monkeypatch.setattr(against, "_ROUND_S", 0.0)
     assert counted(1.0)[0] == against.ROUNDS
