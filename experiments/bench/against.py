@@ -33,7 +33,7 @@ from sim.errors import InputError, require, required
 ROUNDS = 5  # of fresh processes
 _SLICE_S = 0.003  # of processor time, after which a process lets the other one run
 _TURNS = range(6, 41)  # of a round, as many as the noise asks for;
-_SURE = 0.015  # until the medians have this standard error, as a share,
+_SURE = 0.02  # until the medians have this standard error, as a share,
 _ROUND_S = 20.0  # or this time is up
 _LOCK = "requirements.lock"  # of the environment
 _WALL = ("compile", "external", "sweep", "sweep_scale")  # their children do the work
