@@ -162,7 +162,7 @@ def test_code_of_ones_own_that_fails_is_named(here, monkeypatch, name):
     refused(called("run", *DRIVE, "estimator._target_=own_module.Own"), "own_module.Own")
 
 
-@pytest.mark.parametrize("target", ["..x", ".x", "x.", "os.path", "a b.c", "é.x"])
+@pytest.mark.parametrize("target", ["..x", ".x", "x.", "os.path", "a b.c", "é.x", "builtins.dict"])
 def test_a_target_that_names_nothing_is_refused(here, target):
     refused(called("run", *DRIVE, f"estimator._target_='{target}'"), target)
 
