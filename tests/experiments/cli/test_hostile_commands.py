@@ -122,6 +122,7 @@ def test_what_lies_among_the_rows_is_read_within_bounds(here, name, kind):
         (["run", *DRIVE, "world=streets", "world.n_x=1000000"], "2500 are the most"),
         (["run", *DRIVE, "world=rooms", "world.n_landmarks=10000000000"], "world.n_landmarks"),
         (["options", "study", "q", "--config-dir", "own"], "not UTF-8 text"),
+        (["report", "s", "--config-dir", "nope"], "--config-dir must name a folder"),
         (["view", "--map", "own/grid.yaml", "-o", "a.png"], "not a file"),
     ],
     ids=lambda words: words[-1] if isinstance(words, list) else "",
