@@ -15,7 +15,7 @@ import numpy as np
 
 from sim import se2
 from sim.arrays import Array
-from sim.errors import InputError
+from sim.errors import InputError, require
 from sim.formats.assemble import pose_by_wheels
 from sim.formats.rosbag import (
     ABOUT,
@@ -44,6 +44,7 @@ from sim.sensors import Mount, point_cloud
 from sim.sensors.base import is_ours
 
 _MARKER_POINTS, _MARKER_LINES = 8, 5
+_IN_BAGS = (".yaml", ".mcap", ".db3", ".zstd")
 _OPTICAL = np.array([-0.5, 0.5, -0.5, 0.5])  # quaternion of the optical frame on the camera
 
 
@@ -57,7 +58,7 @@ def write_bag(
     """Write a Recording and estimates; the name's ending chooses the format.
 
     `.bag` is ROS 1, `.mcap` a single MCAP file, `.db3` or no ending a folder as `ros2 bag` writes
-    it, with SQLite or MCAP inside. What stands there is replaced.
+    it, with SQLite or MCAP inside. A bag that stands there is replaced.
 
     Parameters
     ----------
@@ -69,9 +70,12 @@ def write_bag(
     Raises
     ------
     InputError
-        If the library is missing, or the file cannot be written.
+        If the library is missing, the file cannot be written, or a folder that is not a bag alone
+        stands there.
     """
     library()
+    others = [p.name for p in path.iterdir() if p.suffix not in _IN_BAGS] if path.is_dir() else []
+    require(not others, f"{path}: a folder with {others[:1]}, not a bag; choose another name")
     ros1 = path.suffix == ".bag"
     part: Path | None = None
     try:

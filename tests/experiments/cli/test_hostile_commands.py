@@ -118,6 +118,8 @@ def test_what_lies_among_the_rows_is_read_within_bounds(here, name, kind):
         (["run", "-m", *DRIVE, *BASIC, "keep=[],[particles]"], "keep decides no result"),
         (["run", *DRIVE, "robot.kr=1e300"], "the robot's motion is not finite; check robot.kr"),
         (["run", *DRIVE, "route.rest_s=1e308"], "route.rest_s last 1e+308 s"),
+        (["run", *QUICK, "route.distance_m=1e15"], "at most 100000"),
+        (["run", *DRIVE, "repeats=999999999"], "from 1 to 100000"),
         (["run", *DRIVE, "world=rooms", "world.n_x=1000000"], "2500 are the most"),
         (["run", *DRIVE, "world=streets", "world.n_x=1000000"], "2500 are the most"),
         (["run", *DRIVE, "world=rooms", "world.n_landmarks=10000000000"], "world.n_landmarks"),

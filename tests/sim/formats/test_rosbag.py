@@ -236,6 +236,20 @@ def test_a_scanner_mounted_upside_down(tmp_path):
     np.testing.assert_allclose(bearings, [-0.3, -0.1, 0.1, 0.3], atol=1e-6)
 
 
+@pytest.mark.parametrize("name", ["mine", "mine.bag", "mine.mcap", "mine.db3"])
+def test_a_folder_of_other_things_is_not_replaced(tmp_path, name):
+    folder, recording = tmp_path / name, fakes.circle(n_frames=5)
+    folder.mkdir()
+    (folder / "thesis.tex").write_text("kept")
+    with pytest.raises(InputError, match=r"a folder with \['thesis.tex'\], not a bag"):
+        write_bag(folder, recording)
+    assert (folder / "thesis.tex").read_text() == "kept"
+    (folder / "thesis.tex").unlink()
+    for _ in range(2):  # an empty folder, and a bag
+        write_bag(folder, recording)
+        assert len(read_bag(folder).frame_stamps) == 5
+
+
 def test_refusals(tmp_path):
     with pytest.raises(InputError, match="no such bag"):
         read_bag(tmp_path / "absent.mcap")
