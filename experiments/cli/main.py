@@ -15,7 +15,7 @@ from experiments.cli.flags import PASS_ON
 from experiments.runs.console import exit_with
 from experiments.runs.paths import TRUST
 from experiments.runs.version import code_version
-from sim.errors import InputError
+from sim.errors import InputError, require
 
 app = typer.Typer(
     help="Estima: simulate differential-drive robots, run localization on the same recordings, "
@@ -112,6 +112,7 @@ def main() -> None:
         except OSError:
             gone = "the current folder is gone, or may not be entered; cd to another"
             raise InputError(gone) from None
+        _check_environment()
         try:
             app(_own_first(sys.argv[1:]))
         finally:
@@ -122,6 +123,17 @@ def main() -> None:
         if ended.code == _INTERRUPTED:  # Typer has caught the interrupt, which may hold a message
             exit_with(ended)
         raise
+
+
+def _check_environment() -> None:
+    """Refuse, or bound, what libraries would fail at."""
+    threads = os.environ.get("OMP_NUM_THREADS") or "1"
+    require(
+        threads.isdecimal() and int(threads) >= 1,
+        f"OMP_NUM_THREADS must be a whole number, at least 1, got {threads!r}",
+    )
+    if os.environ.get("COLUMNS", "").isdecimal():  # a page of help is drawn as wide
+        os.environ["COLUMNS"] = str(min(int(os.environ["COLUMNS"]), 1000))
 
 
 def _open_closed_streams() -> None:

@@ -9,6 +9,7 @@ import sys
 import numpy as np
 import pytest
 
+from experiments.cli.main import main
 from experiments.runs.store import write_run
 from sim.formats.carmen import write_carmen
 from sim.recording import save
@@ -248,6 +249,26 @@ def test_streams_that_cannot_be_written(here, kind, number):
     assert int((here / "code").read_text()) in (0, 1), said.stderr
     assert "Traceback" not in said.stderr
     assert "Exception ignored" not in said.stderr
+
+
+def run_cli(monkeypatch, *arguments):
+    monkeypatch.setattr(sys, "argv", ["estima", *arguments])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    return ended.value.code
+
+
+@pytest.mark.parametrize("value", ["abc", "0", "-1", "4,2"])
+def test_a_number_of_threads_that_libraries_fail_at_is_named(monkeypatch, capsys, value):
+    monkeypatch.setenv("OMP_NUM_THREADS", value)
+    assert run_cli(monkeypatch, "--version") == 2
+    assert "OMP_NUM_THREADS must be a whole number" in capsys.readouterr().err
+
+
+def test_a_terminal_without_end_is_bounded(monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "99999999")
+    assert run_cli(monkeypatch, "--help") == 0
+    assert max(map(len, capsys.readouterr().out.splitlines())) <= 1000
 
 
 def test_a_folder_that_is_gone_is_named(here, monkeypatch):
