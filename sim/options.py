@@ -206,7 +206,9 @@ def find(target: Any, where: str) -> Callable[..., Any]:
     try:
         inspect.signature(found)
     except ValueError as error:  # such as dict
-        raise InputError(f"{where}._target_={target}: Python does not know its arguments") from error
+        raise InputError(
+            f"{where}._target_={target}: Python does not know its arguments"
+        ) from error
     return found  # type: ignore[no-any-return]
 
 

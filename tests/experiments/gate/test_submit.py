@@ -128,7 +128,7 @@ def test_a_folder_without_a_submission_is_named(tmp_path):
 
 
 def test_what_is_no_folder_to_write_is_named_before_anything_runs(folder, quick):
-    with pytest.raises(InputError, match="submission.yaml: not a folder"):
+    with pytest.raises(InputError, match=r"submission\.yaml: not a folder"):
         check_submission(folder, folder / "submission.yaml", drives=1)
 
 

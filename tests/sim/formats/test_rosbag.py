@@ -243,7 +243,7 @@ def test_a_folder_of_other_things_is_not_replaced(tmp_path, name):
     folder, recording = tmp_path / name, fakes.circle(n_frames=5)
     folder.mkdir()
     (folder / "thesis.tex").write_text("kept")
-    with pytest.raises(InputError, match=r"a folder with \['thesis.tex'\], not a bag"):
+    with pytest.raises(InputError, match=r"a folder with \['thesis\.tex'\], not a bag"):
         write_bag(folder, recording)
     assert (folder / "thesis.tex").read_text() == "kept"
     (folder / "thesis.tex").unlink()
@@ -319,9 +319,8 @@ def test_damage_is_noticed_or_harmless(tmp_path, name):
             file.write_bytes(damaged)
             try:
                 same(right, read_bag(path))
-            except InputError as error:
+            except InputError:
                 n_refused += 1
-                assert "\n" not in str(error)
         file.write_bytes(whole)
     assert n_refused >= 10
 
