@@ -15,7 +15,7 @@ from experiments.cli.flags import PASS_ON
 from experiments.runs.console import exit_with
 from experiments.runs.paths import TRUST
 from experiments.runs.version import code_version
-from sim.errors import InputError, require
+from sim.errors import InputError, blaming, require
 
 app = typer.Typer(
     help="Estima: simulate differential-drive robots, run localization on the same recordings, "
@@ -127,11 +127,15 @@ def main() -> None:
 
 def _check_environment() -> None:
     """Refuse, or bound, what libraries would fail at."""
-    threads = os.environ.get("OMP_NUM_THREADS") or "1"
-    require(
-        threads.isdecimal() and int(threads) >= 1,
-        f"OMP_NUM_THREADS must be a whole number, at least 1, got {threads!r}",
-    )
+    for name, least in {"OMP_NUM_THREADS": 1, "SOURCE_DATE_EPOCH": 0}.items():
+        given = os.environ.get(name) or "1"
+        require(
+            given.isdecimal() and int(given) >= least,
+            f"{name} must be a whole number, at least {least}, got {given!r}",
+        )
+    if os.environ.get("MPLBACKEND"):
+        with blaming(f"MPLBACKEND={os.environ['MPLBACKEND']}"):
+            import matplotlib  # noqa: F401
     if os.environ.get("COLUMNS", "").isdecimal():  # a page of help is drawn as wide
         os.environ["COLUMNS"] = str(min(int(os.environ["COLUMNS"]), 1000))
 
