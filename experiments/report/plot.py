@@ -273,7 +273,7 @@ def _too_long(texts: Mapping[Any, str], size: Size) -> bool:
 def _by_value(means: pd.DataFrame, x: str, y: str) -> list[Any]:
     """The words of a setting, those with the best mean last."""
     lower = y not in COLUMNS or COLUMNS[y].better == "lower"
-    return means.groupby(x)["value"].mean().sort_values(ascending=not lower).index.tolist()
+    return list(means.groupby(x)["value"].mean().sort_values(ascending=not lower).index)
 
 
 def _texts(column: pd.Series[Any]) -> dict[Any, str]:
