@@ -222,7 +222,7 @@ class Crew:
         self._grid.add(eye[None], ranges[None].astype(np.float32), self._laser.bearings_rad, most_m)
 
     def plan(self, tick: int) -> None:
-        """Look at the goals and ways of all robots that drive, if it is time to."""
+        """Reconsider the goals and paths of all robots that drive, if it is time to."""
         if tick < self._next_tick or self._grid.n_scans == 0:
             return
         self._next_tick = tick + max(round(self._route.replan_s / TICK_S), 1)
