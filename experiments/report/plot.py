@@ -16,7 +16,6 @@ import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike
-from scipy.optimize import isotonic_regression
 
 from experiments.report.export import setting_texts
 from experiments.runs.columns import ANSWER, COLUMNS, PATH, REPEAT, bound_of, format_alike, title
@@ -29,7 +28,7 @@ from experiments.sweeps.collect import (
     result_columns,
     with_answers,
 )
-from experiments.viewing.plotting import literal, plain_log
+from experiments.viewing.plotting import literal, name_ends, plain_log
 from experiments.viewing.style import SERIES, figure
 from sim.errors import InputError, require
 
@@ -359,7 +358,7 @@ def _name_lines(page: Figure, axes: Any, heading: str, size: Size, *, direct: bo
     handles = {label: handle for pair in found for handle, label in zip(*pair, strict=True)}
     beside = _characters(_DIRECT_SHARE * page.get_figwidth(), _FONT[size])
     if direct and axes.size == 1 and max(map(len, handles)) <= beside and _end_alike(page, handles):
-        _name_ends(page, handles)
+        name_ends(page, {label: handle.lines[0] for label, handle in handles.items()})
         return
     most = _characters(0.9 * page.get_figwidth(), _FONT[size])  # of a line
     labels = [textwrap.fill(label, most) for label in handles]
@@ -394,28 +393,6 @@ def _end_alike(page: Figure, handles: Mapping[str, Any]) -> bool:
     ends = np.array([line.axes.transData.transform(line.get_xydata()[-1]) for line in lines])
     box, letter = lines[0].axes.bbox, lines[0].axes.xaxis.label.get_size() * page.dpi / 72.0
     return bool(np.ptp(ends[:, 0]) < 0.1 * box.width and 1.3 * letter * len(lines) < box.height)
-
-
-def _name_ends(page: Figure, handles: Mapping[str, Any]) -> None:
-    """Write each line's name beside its end, moved up or down where names would collide."""
-    lines = {label: handle.lines[0] for label, handle in handles.items()}
-    ax = next(iter(lines.values())).axes
-    ends = {n: ax.transData.transform(line.get_xydata()[-1]) for n, line in lines.items()}
-    names = sorted(ends, key=lambda name: float(ends[name][1]))
-    apart = 1.3 * ax.xaxis.label.get_size() * page.dpi / 72.0
-    steps = apart * np.arange(len(names))
-    wanted = np.array([ends[name][1] for name in names])
-    placed = isotonic_regression(wanted - steps).x + steps
-    placed += min(0.0, ax.bbox.y1 - placed[-1]) + max(0.0, ax.bbox.y0 - placed[0])
-    right = max(float(end[0]) for end in ends.values())
-    for name, height in zip(names, placed.tolist(), strict=True):
-        colour, (x, y) = lines[name].get_color(), ends[name].tolist()
-        ax.annotate(
-            name, lines[name].get_xydata()[-1], va="center", color=colour,
-            xytext=((right - x) * 72.0 / page.dpi + 14.0, (height - y) * 72.0 / page.dpi),
-            textcoords="offset points",
-            arrowprops={"arrowstyle": "-", "lw": 0.5, "color": colour, "shrinkA": 1.0},
-        )  # fmt: skip
 
 
 def by_factors(values: Sequence[float]) -> bool:
