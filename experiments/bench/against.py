@@ -44,7 +44,7 @@ def answer(name):
 """
 # The clocks give processor time. Where they are read, a process that has run for a while answers
 # null, and waits until it is asked again; what that takes does not count. What else the code prints
-# is no answer.
+# goes to stderr.
 _SERVED = """
 import json, sys, threading, time
 out, sys.stdout = sys.stdout, sys.stderr
