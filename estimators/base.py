@@ -65,7 +65,7 @@ class Prior:
         return Gaussian(self.mean, self.covariance)
 
     def require_start(self, estimator: str) -> Gaussian:
-        """Copy of the first belief, without which this estimator cannot start."""
+        """A copy of the first belief; an error if there is none."""
         start = required(self.start, f"{estimator} needs a start pose; set prior.start=tracking")
         return Gaussian(start.mean.copy(), start.covariance.copy())
 

@@ -81,5 +81,12 @@ def note_compiling(path: Path | None) -> None:
 
 def njit(**options: Any) -> Callable[[Function], Function]:
     """`numba.njit` with the compiled code cached on disk; the function keeps its type."""
-    decorator: Callable[[Function], Function] = _njit(cache=True, **options)
-    return decorator
+
+    def decorate(function: Function) -> Function:
+        try:
+            compiled: Function = _njit(cache=True, **options)(function)
+        except RuntimeError:  # neither the package's folder nor the user's cache can be written
+            compiled = _njit(**options)(function)
+        return compiled
+
+    return decorate

@@ -203,6 +203,12 @@ def find(target: Any, where: str) -> Callable[..., Any]:
             ) from error
     found: Any = getattr(module, name, None)
     require(callable(found), f"{where}._target_={target}: {module_name} has no class {name}")
+    try:
+        inspect.signature(found)
+    except ValueError as error:  # such as dict
+        raise InputError(
+            f"{where}._target_={target}: Python does not know its arguments"
+        ) from error
     return found  # type: ignore[no-any-return]
 
 

@@ -37,7 +37,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import lapack
 
 from estimators.base import Belief, Estimate, Prior
 from estimators.gaussian import STILL, Gaussian, between, wrap
@@ -58,6 +58,7 @@ from estimators.laser.scan_matching import MatcherOptions, ScanMatcher
 from estimators.wheels import WheelOptions, WheelPrediction
 from sim import se2
 from sim.arrays import Array, Ints
+from sim.compiled import njit
 from sim.errors import require
 from sim.options import Count, NonNegative, options
 from sim.recording import Frame
@@ -216,14 +217,14 @@ class FixedLag(FixedLagOptions):
 
         of_prior = np.concatenate([(3 + 3 * old[:, None] + np.arange(3)).ravel(), [0, 1, 2]])
         rows = np.concatenate([np.arange(3 * len(old)), 3 * n_landmarks + np.arange(3)])
-        factor = cho_factor(self._prior.covariance[np.ix_(of_prior, of_prior)], lower=True)
+        root_of_prior = _root(self._prior.covariance[np.ix_(of_prior, of_prior)])
         off = (
             np.concatenate([self._landmarks[old].ravel(), self._poses[0]])
             - self._prior.mean[of_prior]
         )
         off[-1] = wrap(off[-1])
-        flat[np.ix_(rows, rows)] = cho_solve(factor, np.eye(len(rows)))
-        flat_g[rows] = cho_solve(factor, off)
+        flat[np.ix_(rows, rows)] = lapack.dpotrs(root_of_prior, np.eye(len(rows)), lower=1)[0]
+        flat_g[rows] = lapack.dpotrs(root_of_prior, off, lower=1)[0]
         fresh = np.arange(3 * len(old), 3 * n_landmarks)
         flat[fresh, fresh] += MIN_INFORMATION
 
@@ -241,10 +242,10 @@ class FixedLag(FixedLagOptions):
         e, by_pose, by_landmark = self._whitened(self._poses[images], seen, points)
         _add(H, g, n_landmarks + images, columns, by_pose, by_landmark, e)
 
-        factor = cho_factor(flat, lower=True)
-        step = -cho_solve(factor, flat_g).reshape(n, 3)
+        factor = _root(flat)
+        step = -lapack.dpotrs(factor, flat_g, lower=1)[0].reshape(n, 3)
         # the newest pose is eliminated last, so its corner of the factor is its information's root
-        return active, step, inverse(np.tril(factor[0][-3:, -3:]))
+        return active, step, inverse(np.tril(factor[-3:, -3:]))
 
     def _absorb(self, image: _Image) -> bool:
         """Make the oldest image of the window part of the prior, which moves on to its pose.
@@ -323,7 +324,10 @@ class FixedLag(FixedLagOptions):
         """Residuals (K, 3) in standard deviations, and derivatives by the pose and landmark."""
         at = self._landmarks[landmarks]
         e, by_pose, by_landmark = residuals_of(self._camera, poses, at, points)
-        whitening = camera_whitening(self._camera, poses, at)
+        if self._camera.in_image:
+            whitening = camera_whitening(self._camera, poses, at)
+        else:  # at the predicted points, once more
+            whitening = whitening_of(self._camera.covariance(e + points))
         return times(whitening, e), whitening @ by_pose, whitening @ by_landmark
 
     @property
@@ -332,10 +336,25 @@ class FixedLag(FixedLagOptions):
         return len(self._prior.mean) // 3 - 1
 
 
+def _root(matrix: Array) -> Array:
+    """Lower factor of a symmetric matrix by Cholesky, which may be overwritten.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If it is not positive definite.
+    """
+    factor, failed = lapack.dpotrf(matrix.T, lower=1, overwrite_a=1)
+    if failed:
+        raise np.linalg.LinAlgError("not positive definite")
+    return np.asarray(factor, dtype=np.float64)
+
+
+@njit()
 def _add(
     H: Array, g: Array, first: Ints, second: Ints, by_first: Array, by_second: Array, e: Array
 ) -> None:
-    """Add K squared residuals to normal equations, each of two nodes; no pair comes twice.
+    """Add K squared residuals to normal equations, each of two nodes.
 
     Parameters
     ----------
@@ -346,13 +365,15 @@ def _add(
     by_first, by_second, e
         (K, 3, 3), (K, 3, 3), (K, 3): derivatives and whitened residuals.
     """
-    n, k, node = len(g), np.arange(len(e)), np.arange(len(g))
-    for nodes, by_node in ((first, by_first), (second, by_second)):
-        select = np.zeros((n, len(e)))
-        select[nodes, k] = 1.0
-        of_node = transpose(by_node)
-        H[node, :, node] += (select @ (of_node @ by_node).reshape(-1, 9)).reshape(n, 3, 3)
-        g += select @ times(of_node, e)
-    cross = transpose(by_first) @ by_second
-    H[first, :, second] += cross
-    H[second, :, first] += transpose(cross)
+    for k in range(len(e)):
+        i, j = first[k], second[k]
+        for a in range(3):
+            for r in range(3):
+                g[i, a] += by_first[k, r, a] * e[k, r]
+                g[j, a] += by_second[k, r, a] * e[k, r]
+                for b in range(3):
+                    cross = by_first[k, r, a] * by_second[k, r, b]
+                    H[i, a, i, b] += by_first[k, r, a] * by_first[k, r, b]
+                    H[j, a, j, b] += by_second[k, r, a] * by_second[k, r, b]
+                    H[i, a, j, b] += cross
+                    H[j, b, i, a] += cross

@@ -207,24 +207,33 @@ class GraphSlam(GraphSlamOptions):
         if key is None:
             self._add_key_frame(scan, None)
             return "first"
-        found = self._match(scan, key, self._in_key)
+        found = _doubted(self._match(scan, key, self._in_key))
         if found.failed or not self._explained(found):
-            found = self._match_path(scan) or found
+            on_path = self._match_path(scan)
+            self._failures += 1
+        else:
+            on_path, self._failures = None, 0
+        found = on_path or found
         status = found.status if found.failed or self._explained(found) else "gated"
-        leaves = self.left_key_frame(found.motion.mean) or found.overlap < _LEAST_OVERLAP
+        unused = status in (*FAILED, "gated")
+        moved = self._in_key if unused else found.complete(self._in_key)
+        leaves = self._failures >= _PATIENCE or self.left_key_frame(moved.mean)
+        leaves |= not unused and found.overlap < _LEAST_OVERLAP
         if found.status == "ok" and (leaves or status == "gated"):
             self._noise.compare_wheels(self._by_wheels, found.motion)
-        if status in (*FAILED, "gated"):
-            self._failures += 1
-            if self._failures >= _PATIENCE or self.left_key_frame(self._in_key.mean):
+        if unused:
+            if leaves:
                 self._add_key_frame(scan, None)
             return status
-        self._failures = 0
-        of_base = _scaled(found.motion, 1.0 - self.shared_noise / 2.0)
-        self._in_key = dataclasses.replace(found, motion=of_base).complete(self._in_key)
+        # a patch of path knows a place to centimetres: where the wheels know more, they count
+        shared = self.shared_noise if on_path is None else 0.0
+        of_base = _scaled(found.motion, 1.0 - shared / 2.0)
+        seen = dataclasses.replace(found, motion=of_base).complete(self._in_key)
+        self._in_key = seen if on_path is None else self._in_key.fuse(seen)
         if leaves:
-            own_noise = self.shared_noise / 2.0 * found.known_covariance
-            tie = _scaled(found.motion, 1.0 - self.shared_noise)
+            own_noise = shared / 2.0 * found.known_covariance
+            # in directions that the scans do not hold, the mean is that of the wheels
+            tie = _scaled(Gaussian(moved.mean, found.motion.covariance), 1.0 - shared)
             self._compare_scans(scan, tie if status == "ok" else None)
             self._add_key_frame(scan, tie)
             self._in_key = Gaussian(STILL.mean, own_noise)
@@ -244,9 +253,8 @@ class GraphSlam(GraphSlamOptions):
         found = self._matcher.match(scan, other, guess, self._laser, self._rng)
         if found.failed:
             return found
-        doubt = max(_OVERLAP - found.overlap, 0.0) ** 2 * _WRONG
         motion = _scaled(found.motion, self._noise.of_scans)
-        return dataclasses.replace(found, motion=Gaussian(motion.mean, motion.covariance + doubt))
+        return dataclasses.replace(found, motion=motion)
 
     def _compare_scans(self, scan: PreparedScan, tie: Gaussian | None) -> None:
         """Register a new key frame with the one before the last too, and see how far it is off."""
@@ -448,6 +456,13 @@ class GraphSlam(GraphSlamOptions):
             return None
         mean = found.motion.mean - found.loose @ off  # nothing is known of it, so let it be
         return Edge(first, second, Gaussian(mean, noise), support_m)
+
+
+def _doubted(found: Match) -> Match:
+    """Trust a registration less if the scans share little: ties have no loss that bounds them."""
+    doubt = max(_OVERLAP - found.overlap, 0.0) ** 2 * _WRONG
+    motion = Gaussian(found.motion.mean, found.motion.covariance + doubt)
+    return found if found.failed else dataclasses.replace(found, motion=motion)
 
 
 def _scaled(motion: Gaussian, share: float) -> Gaussian:

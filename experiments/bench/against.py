@@ -1,37 +1,70 @@
 """Old and new code in alternation, in the same minutes on one core: ratios, with intervals.
 
-Times of different days differ by more than most changes do. So a second checkout of the code, at
-an earlier revision, runs in turn with the code as it is, and each pair of runs gives a ratio.
+Times of different days differ by more than most changes do, and on a busy machine so do those of
+one tenth of a second and the next. So a second checkout of the code, at an earlier revision, runs
+in turn with the code as it is. In each of ROUNDS, a process of either is asked for the same, and
+they take turns every few milliseconds, wherever the code looks at the clock.
 """
 
 import dataclasses
 import json
+import math
 import os
 import shutil
+import statistics
 import subprocess
 import sys
+import tempfile
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from experiments.bench.measure import Measurement
 from experiments.evaluation.statistics import Interval, log_ratio_interval
 from experiments.runs import paths
 from experiments.runs.console import warn
-from sim.errors import InputError, require
+from sim.errors import InputError, require, required
 
-PAIRS = 5
+ROUNDS = 5  # of fresh processes
+_SLICE_S = 0.003  # of processor time, after which a process lets the other one run
+_TURNS = range(6, 41)  # of a round, as many as the noise asks for;
+_SURE = 0.02  # until the medians have this standard error, as a share,
+_ROUND_S = 20.0  # or this time is up
 _LOCK = "requirements.lock"  # of the environment
 _WALL = ("compile", "external", "sweep", "sweep_scale")  # their children do the work
 _BENCH = """
-import sys, time
-if sys.argv[2] == "processor":
-    time.perf_counter = time.process_time
 from experiments.bench import run_bench
-print(run_bench(sys.argv[1], as_json=True))
+def answer(name):
+    return json.loads(run_bench(name, as_json=True))["results"]
 """
+# The clocks give processor time. Where they are read, a process that has run for a while answers
+# null, and waits until it is asked again; what that takes does not count. What else the code prints
+# goes to stderr.
+_SERVED = """
+import json, sys, threading, time
+out, sys.stdout = sys.stdout, sys.stderr
+own, lost_s, last_s, main = time.process_time, 0.0, 0.0, threading.get_ident()
+def processor_s():
+    global lost_s, last_s
+    now_s, before_s = own(), lost_s
+    if now_s - last_s > {slice_s} and threading.get_ident() == main:
+        print("null", file=out, flush=True)
+        sys.stdin.readline()
+        last_s = own()
+        lost_s += last_s - now_s
+    return now_s - before_s
+if {slice_s}:
+    time.process_time = time.perf_counter = processor_s
+{script}
+for line in iter(sys.stdin.readline, ""):
+    print(json.dumps(answer(line.strip())), file=out, flush=True)
+"""
+Ask = Callable[[str], Any]
 
 
 @dataclass(frozen=True)
@@ -108,6 +141,19 @@ def _share_compiled(here: Path, there: Path) -> None:
             shutil.copy2(path, copy)
 
 
+def _command(folder: Path, script: str, *arguments: str) -> dict[str, Any]:
+    """How a script starts that imports the code of a folder before that of now."""
+    threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
+    found = os.pathsep.join(map(str, (folder, paths.SOURCE)))
+    places = {"PYTHONPATH": found, "ESTIMA_RESULTS": str(paths.results())}
+    command = [sys.executable, "-c", script, *arguments]
+    return {"args": command, "cwd": folder, "env": {**os.environ, **threads, **places}}
+
+
+def _why(stderr: str, code: int | None) -> str:
+    return (stderr.strip().splitlines() or [f"code {code}"])[-1]
+
+
 def run_in(folder: Path, script: str, *arguments: str) -> Any:
     """What a script prints, as JSON, that imports the code of a folder before that of now.
 
@@ -116,19 +162,59 @@ def run_in(folder: Path, script: str, *arguments: str) -> Any:
     InputError
         If it fails.
     """
-    threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
-    found = os.pathsep.join(map(str, (folder, paths.SOURCE)))
-    places = {"PYTHONPATH": found, "ESTIMA_RESULTS": str(paths.results())}
-    ran = subprocess.run(
-        [sys.executable, "-c", script, *arguments],
-        cwd=folder,
-        env={**os.environ, **threads, **places},
-        capture_output=True,
-        text=True,
-    )
-    why = (ran.stderr.strip().splitlines() or [f"code {ran.returncode}"])[-1]
-    require(ran.returncode == 0, f"{folder}: {why}")
+    ran = subprocess.run(**_command(folder, script, *arguments), capture_output=True, text=True)
+    require(ran.returncode == 0, f"{folder}: {_why(ran.stderr, ran.returncode)}")
     return json.loads(ran.stdout)
+
+
+@contextmanager
+def serving(
+    script: str, arguments: Sequence[str], folder: Path, slice_s: float = _SLICE_S
+) -> Iterator[Ask]:
+    """A process with the code of a folder, which is asked for one item after the other.
+
+    It answers None where the other process should run for a while; ask again.
+
+    Parameters
+    ----------
+    script
+        Defines `answer`, a function of the item that returns what JSON can hold, by the clocks
+        of processor time.
+    slice_s
+        Processor time between such answers; 0: none, and the clocks are those of the system.
+
+    Raises
+    ------
+    InputError
+        When asked, if it fails.
+    """
+    with tempfile.TemporaryFile("w+") as errors:
+        child = subprocess.Popen(
+            **_command(folder, _SERVED.format(script=script, slice_s=slice_s), *arguments),
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=errors,
+            text=True,
+        )
+
+        asked, answered = required(child.stdin, "pipe"), required(child.stdout, "pipe")
+
+        def ask(item: str) -> Any:
+            try:
+                print(item, file=asked, flush=True)
+                return json.loads(answered.readline())
+            except (OSError, ValueError):
+                child.kill()
+                child.wait()
+                errors.seek(0)
+                why = _why(errors.read(), child.returncode)
+                raise InputError(f"{folder}: {why}") from None
+
+        with child:
+            try:
+                yield ask
+            finally:
+                child.kill()
 
 
 @contextmanager
@@ -146,47 +232,80 @@ def on_one_core() -> Iterator[None]:
 
 
 def alternate(
-    measure: Callable[[Path], Mapping[str, float]],
+    start: Callable[[Path], AbstractContextManager[Ask]],
+    items: Sequence[str],
     new: Path,
     old: Path,
-    pairs: int = PAIRS,
     on_progress: Callable[[float], None] = lambda _: None,
 ) -> dict[str, Interval]:
-    """Ratio new / old of each figure that both give, with its 95 % interval over the pairs.
+    """Ratio new / old of each figure that both give, with its 95 % interval over ROUNDS.
 
-    The order turns with each pair, so that a machine that slows down favours neither.
+    Parameters
+    ----------
+    start
+        Starts a process with the code of a folder, which answers an item with its figures, or
+        with None where the other should run for a while.
     """
-    times: dict[Path, list[Mapping[str, float]]] = {new: [], old: []}
+    rounds: dict[str, list[float]] = {}
     with on_one_core():
-        for pair in range(pairs):
-            for folder in (new, old) if pair % 2 else (old, new):
-                times[folder].append(measure(folder))
-            on_progress((pair + 1) / pairs)
-    runs = [*times[new], *times[old]]
-    names = [name for name in runs[0] if all(run.get(name, 0.0) > 0.0 for run in runs)]
-    return {
-        name: log_ratio_interval(
-            [run[name] for run in times[new]], [run[name] for run in times[old]]
-        )
-        for name in names
-    }
+        for number in range(ROUNDS):
+            with start(old) as before, start(new) as now:
+                for done, item in enumerate(items, start=1):
+                    for name, ratios in _turns(item, now, before, number).items():
+                        rounds.setdefault(name, []).append(statistics.median(ratios))
+                    on_progress((number + done / len(items)) / ROUNDS)
+    every = {name: medians for name, medians in rounds.items() if len(medians) == ROUNDS}
+    return {name: log_ratio_interval(m, np.ones(ROUNDS)) for name, m in every.items()}
+
+
+def _turns(item: str, now: Ask, before: Ask, first: int) -> dict[str, list[float]]:
+    """Ratios of each figure by turns: who comes first changes, so that no drift favours either."""
+    ratios: dict[str, list[float]] = {}
+    until = math.inf  # the first turn may have to compile
+    for turn in range(first, first + _TURNS.stop - 1):
+        given: dict[Ask, Mapping[str, float]] = {}
+        waiting = [now, before] if turn % 2 else [before, now]
+        while waiting:
+            given |= {ask: found for ask in waiting if (found := ask(item)) is not None}
+            waiting = [ask for ask in waiting if ask not in given]
+        for name, value in given[now].items():
+            if value > 0.0 and given[before].get(name, 0.0) > 0.0:
+                ratios.setdefault(name, []).append(value / given[before][name])
+        until = min(until, time.monotonic() + _ROUND_S)
+        if time.monotonic() >= until or all(map(_is_sure, ratios.values())):
+            break
+    return ratios
+
+
+def _is_sure(ratios: Sequence[float]) -> bool:
+    """Whether their median has a small standard error, taken from the deviations' median."""
+    away = float(np.median(np.abs(np.array(ratios) - np.median(ratios))))
+    return len(ratios) >= _TURNS.start and 1.86 * away / math.sqrt(len(ratios)) < _SURE
 
 
 def run_against(
     name: str, revision: str, on_progress: Callable[[float], None] = lambda _: None
 ) -> list[Measurement]:
     """A suite's last measurements of the code as it is, with their ratios to a revision's."""
-    old, clock = checkout(revision), "wall" if name in _WALL else "processor"
+    old, slice_s = checkout(revision), 0.0 if name in _WALL else _SLICE_S
     last: Sequence[Mapping[str, Any]] = ()
 
-    def measure(folder: Path) -> dict[str, float]:
-        nonlocal last
-        results = run_in(folder, _BENCH, name, clock)["results"]
-        if folder == paths.SOURCE:
-            last = results
-        return {result["name"]: result["value"] for result in results}
+    @contextmanager
+    def start(folder: Path) -> Iterator[Ask]:
+        with serving(_BENCH, [], folder, slice_s) as ask:
 
-    ratios = alternate(measure, paths.SOURCE, old.folder, on_progress=on_progress)
+            def figures(item: str) -> dict[str, float] | None:
+                nonlocal last
+                results = ask(item)
+                if results is None:
+                    return None
+                if folder == paths.SOURCE:
+                    last = results
+                return {result["name"]: result["value"] for result in results}
+
+            yield figures
+
+    ratios = alternate(start, [name], paths.SOURCE, old.folder, on_progress=on_progress)
     found = [Measurement(**result) for result in last]
     return [
         dataclasses.replace(m, ratio=r.value, ratio_low=r.low, ratio_high=r.high)

@@ -11,6 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from experiments.cli import completion
+from sim.errors import require
 
 PASS_ON = {
     "allow_extra_args": True,
@@ -24,8 +25,18 @@ Overrides = Annotated[
         autocompletion=completion.overrides,
     ),
 ]
+
+
+def _check_folder(folder: Path | None) -> Path | None:
+    require(folder is None or folder.is_dir(), f"--config-dir must name a folder, got {folder}")
+    return folder
+
+
 ConfigDir = Annotated[
-    Path | None, typer.Option("--config-dir", "-cd", help="Folder with options of your own.")
+    Path | None,
+    typer.Option(
+        "--config-dir", "-cd", help="Folder with options of your own.", callback=_check_folder
+    ),
 ]
 Log = Annotated[list[Path], typer.Argument(help="A recording (.npz) or a log of any format.")]
 WhichRobot = Annotated[

@@ -47,10 +47,6 @@ def options(
         require(name is None, f"{name}: metrics have no options of their own")
         show(columns.as_text())
         return
-    require(
-        config_dir is None or config_dir.is_dir(),
-        f"--config-dir must name a folder, got {config_dir}",
-    )
     if group is not None and name is None and group not in completion.GROUPS:
         group, name = _group_of(group, config_dir), group
     if group is not None and name is not None:

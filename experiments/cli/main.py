@@ -15,7 +15,7 @@ from experiments.cli.flags import PASS_ON
 from experiments.runs.console import exit_with
 from experiments.runs.paths import TRUST
 from experiments.runs.version import code_version
-from sim.errors import InputError
+from sim.errors import InputError, blaming, require
 
 app = typer.Typer(
     help="Estima: simulate differential-drive robots, run localization on the same recordings, "
@@ -112,6 +112,7 @@ def main() -> None:
         except OSError:
             gone = "the current folder is gone, or may not be entered; cd to another"
             raise InputError(gone) from None
+        _check_environment()
         try:
             app(_own_first(sys.argv[1:]))
         finally:
@@ -122,6 +123,21 @@ def main() -> None:
         if ended.code == _INTERRUPTED:  # Typer has caught the interrupt, which may hold a message
             exit_with(ended)
         raise
+
+
+def _check_environment() -> None:
+    """Refuse, or bound, what libraries would fail at."""
+    for name, least in {"OMP_NUM_THREADS": 1, "SOURCE_DATE_EPOCH": 0}.items():
+        given = os.environ.get(name) or "1"
+        require(
+            given.isdecimal() and int(given) >= least,
+            f"{name} must be a whole number, at least {least}, got {given!r}",
+        )
+    if os.environ.get("MPLBACKEND"):
+        with blaming(f"MPLBACKEND={os.environ['MPLBACKEND']}"):
+            import matplotlib  # noqa: F401
+    if os.environ.get("COLUMNS", "").isdecimal():  # a page of help is drawn as wide
+        os.environ["COLUMNS"] = str(min(int(os.environ["COLUMNS"]), 1000))
 
 
 def _open_closed_streams() -> None:

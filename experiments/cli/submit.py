@@ -29,7 +29,7 @@ def check(
             file_okay=False,
         ),
     ] = None,
-    drives: Annotated[int, typer.Option(min=1, help="In each class of world.")] = 3,
+    drives: Annotated[int, typer.Option(min=1, max=1000, help="In each class of world.")] = 3,
     seed: Annotated[
         int | None, typer.Option(help="Of the first drive; by default drawn, and written out.")
     ] = None,

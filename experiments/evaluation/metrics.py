@@ -124,7 +124,8 @@ def nees(truth: Array, means: Array, covariances: Array) -> Array:
 def ellipse_area_m2(covariances: Array) -> Array:
     """Areas (T,) of the 95 % position ellipses, m^2: pi chi2 sqrt(det)."""
     block = covariances[:, :2, :2]
-    determinant = block[:, 0, 0] * block[:, 1, 1] - block[:, 0, 1] * block[:, 1, 0]
+    with np.errstate(over="ignore", invalid="ignore"):  # of one that diverged
+        determinant = block[:, 0, 0] * block[:, 1, 1] - block[:, 0, 1] * block[:, 1, 0]
     return np.asarray(math.pi * CHI2_95_2DOF * np.sqrt(np.maximum(determinant, 0.0)))
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from experiments.bench.against import alternate, checkout, run_in
+from experiments.bench.against import alternate, checkout, serving
 from experiments.evaluation.statistics import Interval
 from experiments.gate.suite import Suite, overrides_of, read_suite, suite_path
 from experiments.runs import paths
@@ -16,20 +16,19 @@ from experiments.runs.console import progress, show
 from sim.errors import require
 
 MARGIN = 1.10  # a ratio whose whole interval lies above is red
-_REPEATS = 8  # the first compiles; the fastest of the others is the least disturbed
+_REPEATS = 3  # drives a turn
 _STEPS = """
-import json, sys, time
-time.perf_counter = time.process_time
 from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
-found = {}
-for name, overrides in json.loads(sys.argv[1]).items():
+runs, made = json.loads(sys.argv[1]), {}
+def answer(name):
     try:
-        rows = evaluate(Experiment.compose(overrides))
-        found[name] = min(r["cpu_time_us"] for r in rows if r["repeat"] > 0)
+        if name not in made:
+            made[name] = Experiment.compose(runs[name])
+            evaluate(made[name])  # compiles
+        return {name: sum(row["cpu_time_us"] for row in evaluate(made[name]))}
     except Exception:
-        pass  # this revision has no such estimator
-print(json.dumps(found))
+        return {}  # this revision has no such estimator
 """
 
 
@@ -53,9 +52,10 @@ def run_speed(
 
 def step_ratios(suite: Suite, new: Path, old: Path) -> dict[str, Interval]:
     """Processor time of every estimator's step by the code of one folder over another's."""
-    measure = partial(_step_times, commands(suite))
+    runs = commands(suite)
+    start = partial(serving, _STEPS, [json.dumps(runs)])
     with progress("timing the steps", 1.0) as on_progress:
-        return alternate(measure, new, old, on_progress=on_progress)
+        return alternate(start, list(runs), new, old, on_progress=on_progress)
 
 
 def commands(suite: Suite) -> dict[str, list[str]]:
@@ -66,11 +66,6 @@ def commands(suite: Suite) -> dict[str, list[str]]:
         suite.compose(overrides)
         runs[entry.name] = [*searched(suite.config_dir), *overrides, f"repeats={_REPEATS}"]
     return runs
-
-
-def _step_times(runs: Mapping[str, Sequence[str]], folder: Path) -> dict[str, float]:
-    found: dict[str, float] = run_in(folder, _STEPS, json.dumps(runs))
-    return found
 
 
 def slower(ratios: Mapping[str, Interval]) -> list[str]:

@@ -123,6 +123,8 @@ def check_submission(
         If the folder is not a submission, or it cannot be built.
     """
     submission = read_submission(folder)
+    out = out or paths.results() / "submissions" / submission.name
+    require(not out.exists() or out.is_dir(), f"{out}: not a folder; name one with -o")
     first = secrets.choice(range(*_SEEDS)) if seed is None else seed
     digest = _digest(folder)
     if submission.build:
@@ -133,7 +135,6 @@ def check_submission(
         checks = _checks(settings, submission)
         rows = _rows(settings, submission, range(first, first + drives))
     score = Score(submission, checks, rows)
-    out = out or paths.results() / "submissions" / submission.name
     _write(score, out, {"files": digest, "first_seed": first, "drives": drives})
     return score, out
 

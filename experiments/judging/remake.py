@@ -34,7 +34,7 @@ Remake = tuple[Callable[..., Tables], tuple[Any, ...]]  # a call that makes a ro
 
 
 def whole(table: str, function: Callable[..., pd.DataFrame], *arguments: Any) -> Tables:
-    """Give what a function makes as a table."""
+    """The table that a function makes."""
     return {table: function(*arguments)}
 
 

@@ -8,12 +8,14 @@ import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
+from numpy.typing import ArrayLike
 
 from experiments.report.export import setting_texts
 from experiments.runs.columns import ANSWER, COLUMNS, PATH, REPEAT, bound_of, format_alike, title
@@ -26,7 +28,7 @@ from experiments.sweeps.collect import (
     result_columns,
     with_answers,
 )
-from experiments.viewing.plotting import literal, plain_log
+from experiments.viewing.plotting import literal, name_ends, plain_log
 from experiments.viewing.style import SERIES, figure
 from sim.errors import InputError, require
 
@@ -38,10 +40,10 @@ _LEAST = 3.0  # factor below which no axis is
 _BESIDE = 0.006  # share of the axis
 _BESIDE_WORD = 0.12  # among words and seeds: share of what is between two of them
 _MOST_BESIDE = 0.7  # the same, of all lines together
-_MOST_DIRECT = 6  # lines that are named at their ends rather than in a legend
 _DIRECT_SHARE = 0.25  # of the page's width, for those names
 _AXES_SHARE = 0.55  # of the height, at least for the axes; a page with a long legend is higher
 _MOST_COLUMNS = 6  # of a legend
+_ROW_IN = 0.26  # of a word on the y axis
 _LETTER = 0.55  # width of a letter, em
 
 
@@ -129,7 +131,9 @@ def sweep_figure(
     chosen = Size(size)
     page, axes = _panels(chosen, len(down), len(across))
     numeric = means[x].dtype.kind in "fi"
-    shown = _Across(sorted(means[x].unique()), numeric, numeric and x not in (*DRAWN, REPEAT))
+    sideways = not numeric and len(down) == len(across) == 1 and _too_long(texts[x], chosen)
+    names = _by_value(means, x, y) if sideways else sorted(means[x].unique())
+    shown = _Across(names, numeric, numeric and x not in (*DRAWN, REPEAT), sideways)
     for (i, above), (j, left) in itertools.product(enumerate(down), enumerate(across)):
         ax = axes[i, j]
         panel = {name: value for name, value in ((row, above), (col, left)) if name is not None}
@@ -139,27 +143,31 @@ def sweep_figure(
                 continue
             value, low, high = points[["value", "low", "high"]].to_numpy(float).T
             colour, marker = SERIES[k]
+            places = partial(shown.points, line=k, n_lines=len(lines))
+            bars = {"xerr" if sideways else "yerr": (value - low, high - value)}
             ax.errorbar(
-                shown.places(points[x], k, len(lines)), value, yerr=(value - low, high - value),
-                color=colour, marker=marker, ms=4, capsize=2, lw=1.2,
-                ls="-" if shown.joined else "none", label=label,
+                *places(points[x], value), **bars, color=colour, marker=marker, ms=4, capsize=2,
+                lw=1.2, ls="-" if shown.joined else "none", label=label,
             )  # fmt: skip
             below = _rows_of(least, {**panel, **line})
-            ax.plot(shown.places(below[x], k, len(lines)), below["value"], ":", color=colour, lw=1)
-            at = shown.places(alone[x], k, len(lines))
-            ax.plot(at, alone[y], ".", color=colour, ms=4, alpha=0.5)
+            ax.plot(*places(below[x], below["value"]), ":", color=colour, lw=1)
+            ax.plot(*places(alone[x], alone[y]), ".", color=colour, ms=4, alpha=0.5)
         words = (_named(name, value, texts[name]) for name, value in panel.items())
         ax.set_title("; ".join(words), fontsize="medium")
     low, high = (means[side].fillna(means["value"]) for side in ("low", "high"))
     by_decades = low.min() > 0.0 and high.max() >= _WIDE * low.min()
     log = by_decades and (y not in COLUMNS or COLUMNS[y].scale == "log")
     _scale(axes, texts[x], shown, (low.min(), high.max()) if log else None)
-    for ax in axes[-1]:
-        ax.set_xlabel(literal(title(x)))
     least_in = _AXES_SHARE * page.get_figheight()
+    if sideways:
+        page.set_figheight(max(page.get_figheight(), 1.2 + _ROW_IN * len(names)))
+    for ax in axes[-1]:
+        ax.set_xlabel(literal(title(y if sideways else x)))
     whole = "\u00a0".join(literal(title(y)).rsplit(" ", 1))  # a unit has no line of its own
     of_y = textwrap.fill(whole, _characters(1.2 * least_in, _FONT[chosen])).replace("\u00a0", " ")
-    if len(down) > 1:  # one label beside all, as one each would collide on a column's width
+    if sideways:
+        pass  # the names of estimators or worlds need no heading
+    elif len(down) > 1:  # one label beside all, as one each would collide on a column's width
         page.supylabel(of_y, fontsize=_FONT[chosen])
     else:
         axes[0, 0].set_ylabel(of_y)
@@ -229,13 +237,21 @@ class _Across:
     names: Sequence[Any]  # in order
     numeric: bool
     joined: bool  # by lines; seeds have no order
+    sideways: bool  # long words stand on the y axis
 
     @property
     def wide(self) -> bool:
         """Whether the axis is logarithmic."""
         return self.joined and by_factors(self.names)
 
-    def places(self, values: pd.Series[Any], line: int, n_lines: int) -> Any:
+    def points(
+        self, values: pd.Series[Any], results: ArrayLike, line: int, n_lines: int
+    ) -> tuple[Any, Any]:
+        """Coordinates of results."""
+        at = self._places(values, line, n_lines)
+        return (results, at) if self.sideways else (at, results)
+
+    def _places(self, values: pd.Series[Any], line: int, n_lines: int) -> Any:
         """Where values stand, moved a little so that no line's bars hide another's."""
         first, last = self.names[0], self.names[-1]
         at = np.array([v if self.numeric else self.names.index(v) for v in values], float)
@@ -246,6 +262,17 @@ class _Across:
             return at + beside * _BESIDE * (last - first)
         apart = np.diff(self.names).min(initial=last - first) if self.numeric else 1.0
         return at + beside * apart * min(_BESIDE_WORD, _MOST_BESIDE / n_lines)
+
+
+def _too_long(texts: Mapping[Any, str], size: Size) -> bool:
+    """Whether words below the axis would have to be turned."""
+    return sum(len(text) + 2 for text in texts.values()) > _characters(_WIDTH_IN[size], _FONT[size])
+
+
+def _by_value(means: pd.DataFrame, x: str, y: str) -> list[Any]:
+    """The words of a setting, those with the best mean last."""
+    lower = y not in COLUMNS or COLUMNS[y].better == "lower"
+    return list(means.groupby(x)["value"].mean().sort_values(ascending=not lower).index)
 
 
 def _texts(column: pd.Series[Any]) -> dict[Any, str]:
@@ -308,31 +335,30 @@ def _scale(
             ax.minorticks_off()
     elif across.numeric and all(float(name).is_integer() for name in names):
         ax.xaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))  # no half a seed
-    if not across.numeric:
+    if across.sideways:
+        ax.set_yticks(range(len(names)), [names[name] for name in across.names])
+        ax.set_ylim(-0.6, len(names) - 0.4)
+        ax.grid(axis="y", lw=0.3)
+    elif not across.numeric:
         for each in axes[-1]:
             each.set_xticks(range(len(names)), list(names.values()), rotation=25, ha="right")
             each.set_xlim(-0.6, len(names) - 0.4)
     if log is not None:
         low, high = map(float, log)
-        ax.set_yscale("log")
+        ax.set(**{"xscale" if across.sideways else "yscale": "log"})
         if high < _DECADES * low:
-            plain_log(ax.yaxis)
-            ax.yaxis.set_major_formatter(lambda value, _: format_alike([value, low])[0])
+            axis = ax.xaxis if across.sideways else ax.yaxis
+            plain_log(axis)
+            axis.set_major_formatter(lambda value, _: format_alike([value, low])[0])
 
 
 def _name_lines(page: Figure, axes: Any, heading: str, size: Size, *, direct: bool) -> None:
     """Name the lines: at their ends where that fits, else in a legend."""
     found = [ax.get_legend_handles_labels() for ax in axes.flat]
     handles = {label: handle for pair in found for handle, label in zip(*pair, strict=True)}
-    few = axes.size == 1 and len(handles) <= _MOST_DIRECT
     beside = _characters(_DIRECT_SHARE * page.get_figwidth(), _FONT[size])
-    if direct and few and max(map(len, handles)) <= beside and _fits(page, handles):
-        for label, handle in handles.items():
-            line = handle.lines[0]
-            axes[0, 0].annotate(
-                label, (line.get_xdata()[-1], line.get_ydata()[-1]), xytext=(8, 0),
-                textcoords="offset points", va="center", color=line.get_color(),
-            )  # fmt: skip
+    if direct and axes.size == 1 and max(map(len, handles)) <= beside and _end_alike(page, handles):
+        name_ends(page, {label: handle.lines[0] for label, handle in handles.items()})
         return
     most = _characters(0.9 * page.get_figwidth(), _FONT[size])  # of a line
     labels = [textwrap.fill(label, most) for label in handles]
@@ -360,14 +386,13 @@ def _grow(page: Figure, axes: Any, least_in: float) -> None:
         page.set_figheight(page.get_figheight() + math.ceil(20.0 * lacking_in) / 20.0)
 
 
-def _fits(page: Figure, handles: Mapping[str, Any]) -> bool:
-    """Whether the ends of the lines are a line of text apart, and all at the right."""
+def _end_alike(page: Figure, handles: Mapping[str, Any]) -> bool:
+    """Whether all lines end at the right, and the page is high enough for their names."""
     page.draw_without_rendering()
     lines = [handle.lines[0] for handle in handles.values()]
     ends = np.array([line.axes.transData.transform(line.get_xydata()[-1]) for line in lines])
-    apart = np.diff(np.sort(ends[:, 1])) * 72.0 / page.dpi
-    wide = np.ptp(ends[:, 0]) < 0.1 * lines[0].axes.bbox.width
-    return bool(wide and (apart > 1.2 * lines[0].axes.xaxis.label.get_size()).all())
+    box, letter = lines[0].axes.bbox, lines[0].axes.xaxis.label.get_size() * page.dpi / 72.0
+    return bool(np.ptp(ends[:, 0]) < 0.1 * box.width and 1.3 * letter * len(lines) < box.height)
 
 
 def by_factors(values: Sequence[float]) -> bool:

@@ -102,10 +102,14 @@ def recommend(overrides: Sequence[str]) -> Advice:
     InputError
         If an override is wrong, or names an estimator.
     """
-    require(
-        not any(o.lstrip("+~").startswith("estimator") for o in overrides),
-        "leave the estimator out: every one is considered",
-    )
+    for key, reason in {
+        "estimator": "every one is considered",
+        "recording": "state its robot and sensors, by which estimators are compared",
+    }.items():
+        require(
+            not any(o.lstrip("+~").startswith(key) for o in overrides),
+            f"leave the {key} out: {reason}",
+        )
     with open_composer() as composer:
         Experiment(*composer.compose(overrides).resolve()).check()
         everyone = list(_candidates(composer, overrides))

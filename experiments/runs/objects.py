@@ -41,6 +41,7 @@ from sim.sensors import Sensor, Sensors, sensors_from_config
 from sim.sensors.base import RecordedSensor, sensor_settings
 from sim.team import Team
 from sim.worlds import grid_file
+from sim.worlds.floor_plan import NoRoomError
 from sim.worlds.world import World
 
 OF_TEAMS = "ekf_slam, fastslam or smoother"
@@ -85,11 +86,18 @@ class Objects:
         return bool(self.config.get("isolated")) and "command" not in self.config["estimator"]
 
     def world(self) -> World:
-        """Make the world, from its own stream."""
+        """Make the world, from its own stream; if its objects do not fit, it is drawn again."""
         rng = stream(self.config["world_seed"], "world", key="world_seed")
-        made = make(self.config["world"], "world", rng=rng)
-        world: World = made if isinstance(made, World) else made.build(rng)
-        return world
+        tries_left = 5
+        while True:
+            try:
+                made = make(self.config["world"], "world", rng=rng)
+                world: World = made if isinstance(made, World) else made.build(rng)
+                return world
+            except NoRoomError:
+                tries_left -= 1
+                if not tries_left:
+                    raise
 
     def robot(self) -> Any:
         """Make the true robot."""

@@ -7,10 +7,11 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from enum import Enum
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
+from pydantic import Field
 
 from estimators.team import Communication
 from experiments.runs.paths import CONF
@@ -77,7 +78,7 @@ class ScoringOptions:
 class RunOptions:
     """Keys of a run that stand alone."""
 
-    repeats: Count
+    repeats: Annotated[int, Field(ge=1, le=100_000)]
     """Runs of the estimator over the same recording, a row each."""
     keep: list[str]
     """Names of belief extras to record."""

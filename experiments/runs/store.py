@@ -375,7 +375,7 @@ def _files(folder: Path, prefix: str = "") -> list[Path]:
 
 
 def _tables(path: Path, columns: list[str] | None = None) -> list[pa.Table]:
-    """Tables of a file. A journal that became Parquet meanwhile is read as such."""
+    """Tables of a file; of the Parquet file if the journal has become one meanwhile."""
     require_file(path)
     if path.suffix == ".parquet":
         table = read_parquet(path, columns)

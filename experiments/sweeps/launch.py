@@ -301,10 +301,8 @@ _EXTRAS = {"submitit": "slurm", "ray": "ray"}
 def _check_launcher(launching: Sequence[str]) -> None:
     """Check that the launcher is installed, where Hydra would only say that it knows none."""
     for argument in launching:
-        require(
-            not (re.fullmatch(r"\+*hydra\.launcher\.n_jobs=[+-]?0+", argument)),
-            f"{argument}: give the number of processes, or -1 for all cores",
-        )
+        wrong = re.fullmatch(r"\+*hydra\.launcher\.n_jobs=[+-]?(0+|\d{5,})", argument)
+        require(not wrong, f"{argument}: give the number of processes, or -1 for all cores")
         name = argument.partition("=")[2]
         plugin = name.partition("_")[0]
         chosen = argument.lstrip("+").startswith("hydra/launcher=") and plugin in _EXTRAS

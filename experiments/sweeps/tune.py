@@ -25,6 +25,7 @@ import pandas as pd
 import yaml
 from joblib import Parallel, delayed
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from omegaconf import OmegaConf
 
 from experiments.evaluation.statistics import Interval, log_ratio_interval
@@ -38,7 +39,7 @@ from experiments.runs.processes import hold_interrupts
 from experiments.runs.row import Outcome, Row, read_rows, write_frame
 from experiments.sweeps.plan import plan_experiments
 from experiments.sweeps.ranges import FIRST_JUDGED_SEED, Range, Tuning
-from experiments.viewing.plotting import plain_log
+from experiments.viewing.plotting import name_ends, plain_log
 from experiments.viewing.style import SERIES, save_figure, subplots
 from sim.errors import InputError, how_to_install, require
 from sim.files import write_text
@@ -218,6 +219,7 @@ def merge_into(path: Path, table: pd.DataFrame, order: Sequence[str]) -> pd.Data
 def curves(trials: pd.DataFrame, gains: pd.DataFrame) -> Figure:
     """Draw the best value against the trials, and the gains that were judged."""
     page, (left, right) = subplots(10.0, 3.8, 1, 2)
+    lines: dict[str, Line2D] = {}
     bounds = gains[["estimator", "low", "tuned_over_default", "high"]]
     for i, name, low, gain, high in bounds.itertuples(name=None):
         rows = trials[trials["estimator"] == name]
@@ -225,17 +227,18 @@ def curves(trials: pd.DataFrame, gains: pd.DataFrame) -> Figure:
         style = {"color": colour, "marker": marker, "ms": 6}
         best = rows["best_so_far_m"].to_numpy(float)
         at = [i % len(best)]  # one mark a line, at trials of their own, where lines are the same
-        left.step(rows["trial"], best / best[0], where="post", label=name, markevery=at, **style)
+        (line,) = left.step(rows["trial"], best / best[0], where="post", markevery=at, **style)
+        lines[name] = line
         right.errorbar(gain, -i, xerr=[[gain - low], [high - gain]], capsize=3, **style)
     left.set(
         xlabel="trials", ylabel="best error over the default's,\nseeds of tuning", yscale="log"
     )
-    page.legend(loc="outside lower center", ncols=4, fontsize=8)
     right.axvline(1.0, color="0.6", lw=0.8, ls="--")
-    right.set(xlabel="error over the default's, other seeds, 95 % interval", xscale="log")
+    right.set(xlabel="error over the default's, judged seeds [95 %]", xscale="log")
     right.set_yticks(-np.arange(len(gains)), gains["estimator"])
     plain_log(left.yaxis)
     plain_log(right.xaxis)
+    name_ends(page, lines)
     return page
 
 

@@ -141,7 +141,7 @@ def read_odometry_csv(path: Path) -> Estimate:
     rows = []
     require_file(path)
     try:
-        with path.open(newline="") as file:
+        with path.open(newline="", encoding="utf-8-sig") as file:
             table = csv.DictReader(file)
             missing = [name for name in _READ if name not in (table.fieldnames or [])]
             require(

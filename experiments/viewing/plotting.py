@@ -11,9 +11,11 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.patches import Ellipse
 from matplotlib.ticker import LogLocator
 from numpy.typing import ArrayLike
+from scipy.optimize import isotonic_regression
 
 from experiments.evaluation.metrics import CHI2_95_2DOF
 from experiments.evaluation.statistics import Interval
@@ -112,6 +114,28 @@ def with_legend(
     handles, labels = (of or page.axes[0]).get_legend_handles_labels()
     page.legend(handles, labels, loc=loc, ncols=ncols, **style)  # type: ignore[call-overload]
     return page
+
+
+def name_ends(page: Figure, lines: Mapping[str, Line2D]) -> None:
+    """Write each line's name beside its last point, moved up or down where names would collide."""
+    page.draw_without_rendering()
+    ax = next(iter(lines.values())).axes
+    assert ax is not None
+    ends = {n: ax.transData.transform(line.get_xydata()[-1]) for n, line in lines.items()}
+    names = sorted(ends, key=lambda name: float(ends[name][1]))
+    apart = 1.3 * ax.xaxis.label.get_size() * page.dpi / 72.0
+    steps = apart * np.arange(len(names))
+    placed = isotonic_regression(np.array([ends[name][1] for name in names]) - steps).x + steps
+    placed += min(0.0, ax.bbox.y1 - placed[-1]) + max(0.0, ax.bbox.y0 - placed[0])
+    right = max(float(end[0]) for end in ends.values())
+    for name, height in zip(names, placed.tolist(), strict=True):
+        colour, (x, y) = lines[name].get_color(), ends[name].tolist()
+        ax.annotate(
+            name, lines[name].get_xydata()[-1], va="center", color=colour,
+            xytext=((right - x) * 72.0 / page.dpi + 14.0, (height - y) * 72.0 / page.dpi),
+            textcoords="offset points",
+            arrowprops={"arrowstyle": "-", "lw": 0.5, "color": colour, "shrinkA": 1.0},
+        )  # fmt: skip
 
 
 def draw_band(

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from sim.arrays import Array
+from sim.errors import require
 from sim.files import write_whole
 from sim.formats.text import Words, read_words
 
@@ -28,9 +29,16 @@ def read_relations(source: Path | Words) -> Relations:
     Raises
     ------
     InputError
-        Naming the file and the line that is not eight finite numbers.
+        Naming the file and the line that is not eight finite numbers; or if the lines are those of
+        a trajectory, which has eight columns too.
     """
-    table = read_words(source).table(8, "relations")
+    words = read_words(source)
+    table = words.table(8, "relations")
+    turns = np.linalg.norm(table[:, 4:], axis=1)
+    require(
+        not len(table) or np.any(np.abs(turns - 1.0) > 1e-3),
+        f"{words.where}: a trajectory (.tum), not relations",
+    )
     return Relations(table[:, :2].copy(), table[:, [2, 3, 7]])
 
 

@@ -22,6 +22,7 @@ here are read, with our own definitions and never with those in the file. Frames
 | /NAME/map | sensor_msgs/PointCloud2 | an estimate's landmarks |
 | /tf_static | tf2_msgs/TFMessage | where the sensors sit |
 | /estima/about | std_msgs/String | robot, sensors, configuration and Frame stamps as JSON |
+| /estima/checksums | std_msgs/String | type and SHA-256 of the messages of every topic, as JSON |
 
 Stamps become nanoseconds; everything else keeps its digits.
 """
@@ -37,7 +38,7 @@ from sim.arrays import Array, Ints
 from sim.errors import InputError, how_to_install
 from sim.sensors.base import Field, Reading, Schema, Sensors
 
-ABOUT = "/estima/about"
+ABOUT, CHECKSUMS = "/estima/about", "/estima/checksums"
 ODOMETRY = "nav_msgs/msg/Odometry"
 SCAN = "sensor_msgs/msg/LaserScan"
 CLOUD = "sensor_msgs/msg/PointCloud2"

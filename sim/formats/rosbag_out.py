@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import json
 import math
 import shutil
@@ -15,10 +16,11 @@ import numpy as np
 
 from sim import se2
 from sim.arrays import Array
-from sim.errors import InputError
+from sim.errors import InputError, require
 from sim.formats.assemble import pose_by_wheels
 from sim.formats.rosbag import (
     ABOUT,
+    CHECKSUMS,
     CLOUD,
     JOINTS,
     MARKERS,
@@ -44,6 +46,7 @@ from sim.sensors import Mount, point_cloud
 from sim.sensors.base import is_ours
 
 _MARKER_POINTS, _MARKER_LINES = 8, 5
+_IN_BAGS = (".yaml", ".mcap", ".db3", ".zstd")
 _OPTICAL = np.array([-0.5, 0.5, -0.5, 0.5])  # quaternion of the optical frame on the camera
 
 
@@ -57,7 +60,7 @@ def write_bag(
     """Write a Recording and estimates; the name's ending chooses the format.
 
     `.bag` is ROS 1, `.mcap` a single MCAP file, `.db3` or no ending a folder as `ros2 bag` writes
-    it, with SQLite or MCAP inside. What stands there is replaced.
+    it, with SQLite or MCAP inside. A bag that stands there is replaced.
 
     Parameters
     ----------
@@ -69,9 +72,12 @@ def write_bag(
     Raises
     ------
     InputError
-        If the library is missing, or the file cannot be written.
+        If the library is missing, the file cannot be written, or a folder that is not a bag alone
+        stands there.
     """
     library()
+    others = [p.name for p in path.iterdir() if p.suffix not in _IN_BAGS] if path.is_dir() else []
+    require(not others, f"{path}: a folder with {others[:1]}, not a bag; choose another name")
     ros1 = path.suffix == ".bag"
     part: Path | None = None
     try:
@@ -83,9 +89,10 @@ def write_bag(
                 _write_recording(bag, recording, slip)
             for name, track in (tracks or {}).items():
                 _write_track(bag, name, track)
-        if path.suffix == ".mcap":
-            target = target / f"{target.name}.mcap"
-            state_checksum(target)
+        if not ros1 and path.suffix != ".db3":
+            file = target / f"{target.name}.mcap"
+            state_checksum(file)
+            target = file if path.suffix == ".mcap" else target
         if path.is_dir():
             shutil.rmtree(path)
         target.replace(path)
@@ -102,7 +109,7 @@ class _Bag:
     def __init__(self, path: Path, *, ros1: bool, sqlite: bool) -> None:
         self._store, self._ros1 = typestore(ros1=ros1), ros1
         self._blanks: dict[str, Any] = {}
-        self._connections: dict[str, Any] = {}
+        self._written: list[tuple[str, str, int, bytes]] = []
         if ros1:
             from rosbags.rosbag1 import Writer as Writer1
 
@@ -117,8 +124,25 @@ class _Bag:
         self._writer.open()
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind is None:
+            self._write_all()
         self._writer.close()
+
+    def _write_all(self) -> None:
+        """Write the messages, their checksums first: damage that loses those loses what follows."""
+        kinds = {topic: kind for topic, kind, _, _ in self._written}
+        digests = {topic: hashlib.sha256() for topic in kinds}
+        for topic, _, _, data in self._written:
+            digests[topic].update(data)
+        said = {topic: (kind, digests[topic].hexdigest()) for topic, kind in kinds.items()}
+        text = self._serialized(STRING, {"data": json.dumps(said)})
+        first_ns = min((stamp_ns for _, _, stamp_ns, _ in self._written), default=0)
+        connections: dict[str, Any] = {}
+        for topic, kind, stamp_ns, data in [(CHECKSUMS, STRING, first_ns, text), *self._written]:
+            if topic not in connections:
+                connections[topic] = self._writer.add_connection(topic, kind, typestore=self._store)
+            self._writer.write(connections[topic], stamp_ns, data)
 
     def make(self, kind: str, /, **fields: Any) -> Any:
         """A message or part of one; what is not given is zero or empty.
@@ -146,13 +170,11 @@ class _Bag:
 
     def write(self, topic: str, kind: str, stamp: float, /, **fields: Any) -> None:
         """Write a message."""
-        if topic not in self._connections:
-            self._connections[topic] = self._writer.add_connection(
-                topic, kind, typestore=self._store
-            )
-        message = self.make(kind, **fields)
+        self._written.append((topic, kind, nanoseconds(stamp), self._serialized(kind, fields)))
+
+    def _serialized(self, kind: str, fields: dict[str, Any]) -> bytes:
         serialize = self._store.serialize_ros1 if self._ros1 else self._store.serialize_cdr
-        self._writer.write(self._connections[topic], nanoseconds(stamp), serialize(message, kind))
+        return bytes(serialize(self.make(kind, **fields), kind))
 
     def pose(self, pose: Array, z_m: float = 0.0) -> Any:
         x, y, heading = (float(v) for v in pose)

@@ -1,5 +1,6 @@
 """Topics of a bag: reading them within bounds, and what their messages hold."""
 
+import hashlib
 import json
 import math
 import tempfile
@@ -15,6 +16,7 @@ from sim.arrays import Array
 from sim.errors import InputError, require
 from sim.formats.rosbag import (
     ABOUT,
+    CHECKSUMS,
     JOINTS,
     MARKERS,
     READ,
@@ -166,16 +168,16 @@ def read_topics(path: Path) -> tuple[dict[str, Topic], dict[str, Any]]:
     try:
         check_bounds(path)
         with _reader(path) as (reader, store, deserialize):
-            notes = [c for c in reader.connections if (c.topic, c.msgtype) == (ABOUT, STRING)]
-            for connection, _, data in reader.messages(notes) if notes else ():
-                about = _about(path, deserialize(data, connection.msgtype))
-                break
+            said = _said(reader, deserialize, ABOUT)
+            about = _about(path, said) if said is not None else {}
+            stated = json.loads(_said(reader, deserialize, CHECKSUMS) or "{}")
             kinds = {*READ, *_kinds(about, store)}
             wanted = [
                 c
                 for c in reader.connections
                 if c.msgtype == _KINDS.get(c.topic, c.msgtype) in kinds
             ]
+            digests: dict[str, Any] = {c.topic: hashlib.sha256() for c in wanted}
             messages = enumerate(reader.messages(wanted) if wanted else (), start=1)
             for count, (connection, time, data) in messages:
                 require(
@@ -183,9 +185,12 @@ def read_topics(path: Path) -> tuple[dict[str, Topic], dict[str, Any]]:
                     f"{path}: more than {_MOST_MESSAGES} messages; cut it in parts",
                 )
                 topic = topics.setdefault(connection.topic, Topic(connection.msgtype, [], []))
+                if connection.topic in stated:
+                    digests[connection.topic].update(data)
                 if topic.kind == connection.msgtype:
                     topic.times.append(time)
                     topic.messages.append(deserialize(data, connection.msgtype))
+            _check_topics(path, stated, {c.topic: c.msgtype for c in reader.connections}, digests)
     except InputError:
         raise
     # the library reports damaged files by exceptions of many kinds
@@ -194,6 +199,31 @@ def read_topics(path: Path) -> tuple[dict[str, Topic], dict[str, Any]]:
         raise InputError(f"{path}: damaged or not a bag ({reason})") from error
     require(topics, f"{path}: holds no odometry, scans or transforms")
     return topics, about
+
+
+def _said(reader: Any, deserialize: Any, topic: str) -> str | None:
+    """The first text on a topic; None if there is none."""
+    notes = [c for c in reader.connections if (c.topic, c.msgtype) == (topic, STRING)]
+    for connection, _, data in reader.messages(notes) if notes else ():
+        return str(deserialize(data, connection.msgtype).data)
+    return None
+
+
+def _check_topics(
+    path: Path, stated: dict[str, Any], kinds: dict[str, str], digests: dict[str, Any]
+) -> None:
+    """Check that a bag's topics are as they were written: InputError.
+
+    Topics may be gone, or others may have been added, but not both: a topic under another name.
+    """
+    renamed = not stated.keys() <= kinds.keys() and not kinds.keys() <= {*stated, CHECKSUMS}
+    for topic, (kind, digest) in stated.items():
+        same = kinds.get(topic, kind) == kind and not (renamed and topic not in kinds)
+        require(
+            same and (topic not in digests or digests[topic].hexdigest() == digest),
+            f"{path}: the messages of {topic} are not those that were written; if another program "
+            f"wrote them, leave {CHECKSUMS} out of the bag",
+        )
 
 
 @contextmanager
@@ -229,10 +259,10 @@ def _kinds(about: dict[str, Any], store: Any) -> set[str]:
     return kinds
 
 
-def _about(path: Path, message: Any) -> dict[str, Any]:
+def _about(path: Path, said: str) -> dict[str, Any]:
     """What `write_bag` noted about the recording."""
     try:
-        written = json.loads(message.data)
+        written = json.loads(said)
         robot = build(RobotGeometry, written["robot"], "robot")
         require("topics" in written, "of an older version; record and convert again")
         schemas = {k: schema_from_meta(fields) for k, fields in written["schemas"].items()}

@@ -74,7 +74,7 @@ class Ground:
         return cls(low, cell_m, clear_m, walked, per_way)
 
     def middles_m(self, cells: Ints) -> Array:
-        """Middles (N, 2) m in map of cells (N, 2) of the ways."""
+        """Centres (N, 2), m in map, of walkable cells (N, 2)."""
         return self.corner_m + self.cell_m * self.per_way * (cells[:, ::-1] + 0.5)
 
     def cell_of(self, point: Array) -> Ints:

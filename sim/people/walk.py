@@ -142,7 +142,7 @@ class Crowd:
         return np.array(taken)
 
     def advance(self, tick: int, poses: Sequence[Array]) -> None:
-        """Let it be this tick, with the robots at poses (3,); decide on a step if one is due."""
+        """Advance to this tick, with the robots at poses (3,); decide on a step if one is due."""
         self.now_s = tick * TICK_S
         if tick % CONTROL_TICKS:
             return

@@ -33,7 +33,7 @@ from sim.routes.frontiers import (
     nearest,
     unknown_in_sight,
 )
-from sim.routes.route import Controller, PursuitOptions
+from sim.routes.route import Controller, DriveLength, PursuitOptions
 from sim.sensors.base import Reading, Sensors, sensor_of
 from sim.sensors.laser import Laser
 from sim.worlds.grid_mapping import ScanGrid
@@ -62,7 +62,7 @@ class Explore(PursuitOptions):
     the same, but the robots choose one after another, best choice first, and what a frontier is
     worth falls by the chance that it is seen from one already chosen (Burgard et al. 2005).
     `shared_frontiers`: so shared out, but by the way alone (A = 1)."""
-    distance_m: Positive
+    distance_m: DriveLength
     """Where a robot ends, by its own reckoning, if the team sees no frontier any more before."""
     draw: NonNegativeInt = 0
     """Seed of the random strategy."""
@@ -222,7 +222,7 @@ class Crew:
         self._grid.add(eye[None], ranges[None].astype(np.float32), self._laser.bearings_rad, most_m)
 
     def plan(self, tick: int) -> None:
-        """Look at the goals and ways of all robots that drive, if it is time to."""
+        """Reconsider the goals and paths of all robots that drive, if it is time to."""
         if tick < self._next_tick or self._grid.n_scans == 0:
             return
         self._next_tick = tick + max(round(self._route.replan_s / TICK_S), 1)

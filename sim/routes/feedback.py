@@ -70,7 +70,7 @@ class OdometryFeedback:
         self._pose, self._reading_m = np.array(start, float), np.zeros(2)
 
     def restart(self, pose: Array, reading_m: Array) -> None:
-        """Reckon on from a pose (3,), at which the encoders' reading (2,) was this, m."""
+        """Restart at a pose (3,), where the encoders read this (2,), m."""
         self._pose, self._reading_m = np.array(pose, float), reading_m
 
     def pose(self, tick: int, true_pose: Array, encoder_m: Array) -> Array:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import Strict
+from pydantic import Field, Strict
 
 from sim.arrays import Array, ArrayLike
 from sim.errors import require
@@ -23,6 +23,7 @@ from sim.se2 import chain, transform
 from sim.worlds.world import World, facing_second
 
 MOST_S = 1e5  # that a route by the clock lasts: each tick is an array's row
+DriveLength = Annotated[float, Field(gt=0.0, le=1e5)]  # m
 
 Segment = tuple[float, float, float]
 Segments = Annotated[
@@ -145,7 +146,7 @@ class Tour(PursuitOptions):
 
     waypoints: Points | None = None
     """[[x, y], ...], at least two; null for the world's own tour."""
-    distance_m: Positive | None = None
+    distance_m: DriveLength | None = None
     """Where to end, counted along the tour; null for all of it. A longer distance than the tour
     has goes round again if the tour is closed, else back and forth."""
     tolerance_m: Positive = 0.5

@@ -18,6 +18,10 @@ _APART_M = 0.12  # between furniture and walls, and among furniture
 _PROUD_M = 0.01  # landmarks stand this far off their face, so that rays see them from its side
 
 
+class NoRoomError(InputError):
+    """So many objects do not fit, or do not beside the first ones as chance has put them."""
+
+
 @dataclass
 class Plan:
     """What has been drawn so far, in metres.
@@ -146,7 +150,7 @@ class Plan:
 
         Raises
         ------
-        InputError
+        NoRoomError
             If so many do not fit.
         """
 
@@ -182,7 +186,7 @@ class Plan:
 
         Raises
         ------
-        InputError
+        NoRoomError
             If so many do not fit.
         """
         require(count >= 0, f"world: the number of objects must be zero or more, got {count}")
@@ -201,7 +205,7 @@ class Plan:
                     break
             else:
                 width, depth = most - least
-                raise InputError(
+                raise NoRoomError(
                     f"only {placed} of {count} objects fit into a room of {width:.1f} x "
                     f"{depth:.1f} m; ask for fewer, or make it larger"
                 )

@@ -1,4 +1,4 @@
-"""What of a drawn world is otherwise: a map of another day, walls of other stuff, doors."""
+"""Variations of a drawn world: a map from another day, walls of other materials, doors."""
 
 import dataclasses
 import math

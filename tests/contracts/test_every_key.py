@@ -17,7 +17,7 @@ from omegaconf import OmegaConf
 from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
 from experiments.runs.paths import CONF
-from experiments.runs.schema import OPTIONS, TeamSettings, leaves
+from experiments.runs.schema import GROUPS, KEYS, OPTIONS, TeamSettings, leaves
 from sim.errors import InputError
 from sim.options import find
 from sim.recording import arrays_of, digest_of
@@ -141,7 +141,7 @@ def kinds_of(place, settings):
 def options_to_try():
     """One option of each class that conf/ names."""
     seen, options = set(), []
-    for group in ("robot", "world", "sensors", "route", "estimator"):
+    for group in GROUPS:
         for path in sorted((CONF / group).glob("*.yaml")):
             text = OmegaConf.to_container(OmegaConf.load(path), resolve=False)
             targets = frozenset(
@@ -179,8 +179,19 @@ def test_every_other_key_acts_or_is_refused(place):
 
 
 def test_no_key_is_left_out():
-    keys = OmegaConf.load(CONF / "config.yaml").keys() - {"defaults", "hydra"}
-    assert keys <= {*PLACES, *NO_RESULT}
+    """But those of other projects' methods, whose packages are extras."""
+    keys = {*OmegaConf.load(CONF / "config.yaml"), *KEYS} - {"defaults", "hydra"}
+    assert keys <= {*BASES, *PLACES, *NO_RESULT}
+    folders = {path.name for path in CONF.iterdir() if path.is_dir()}
+    assert folders == {*GROUPS, "study", "suite"}
+    where_it_is_computed = {"plan", "job", "jobs"}  # tests/experiments/sweeps/test_plan.py
+    assert {*OmegaConf.load(CONF / "job.yaml")} - {"defaults", "hydra"} == where_it_is_computed
+
+
+def test_options_that_are_named_are_there():
+    named = [key.split(" ")[0] for key in {*BASES, *NO_RESULT, *ACTS} if "=" in key]
+    for group, _, name in (option.partition("=") for option in named):
+        assert (CONF / group / f"{name}.yaml").exists(), f"{group}={name}"
 
 
 def test_a_key_without_effect_is_found(monkeypatch):

@@ -7,8 +7,8 @@ from matplotlib.figure import Figure
 
 from experiments.judging.results import Results
 from experiments.studies.exploration.settings import AFTER_M, BASE, BOTH, NAMES
-from experiments.viewing.plotting import draw_band, with_legend
-from experiments.viewing.style import BLACK, BLUE, GREEN, ORANGE, PURPLE, RED, WALL, subplots
+from experiments.viewing.plotting import draw_band, name_ends, with_legend
+from experiments.viewing.style import BLACK, BLUE, GREEN, ORANGE, PURPLE, RED, subplots
 from experiments.viewing.team_figure import draw_paths
 
 _STRATEGIES = {
@@ -51,9 +51,12 @@ def by_distance(coverage: pd.DataFrame) -> Figure:
         style = {"ls": line, "color": colour, "lw": 1.8, "label": NAMES[strategy]}
         draw_band(ax, middle, (low, high), 0.15, **style)
     ax.axvline(AFTER_M, color=BLACK, lw=0.8)
-    ax.fill_between([], [], color=WALL, alpha=0.15, lw=0, label="quartiles of worlds")
     ax.annotate(f"judged at {AFTER_M:g} m", (AFTER_M, 0.02), (-4, 0), ha="right",
                 xycoords=("data", "axes fraction"), textcoords="offset points",
                 fontsize="small")  # fmt: skip
-    ax.set(xlabel="distance driven a robot, m", ylabel="floor seen by the team, m², median")
-    return with_legend(page, ncols=3)
+    ax.set(
+        xlabel="distance driven by each robot, m",
+        ylabel="floor seen by the team, m²\n(median and quartiles over worlds)",
+    )
+    name_ends(page, {str(line.get_label()): line for line in ax.lines[: len(_STRATEGIES)]})
+    return page

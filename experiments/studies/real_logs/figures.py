@@ -15,7 +15,7 @@ from experiments.studies.real_logs.settings import (
     RESOLUTION_M,
 )
 from experiments.viewing.grid import draw_grid
-from experiments.viewing.plotting import plan_axes, set_axes, with_legend
+from experiments.viewing.plotting import plain_log, plan_axes, set_axes, with_legend
 from experiments.viewing.style import BLACK, CYCLE, subplots
 from sim.worlds.grid import OccupancyGrid
 
@@ -48,9 +48,10 @@ def intel(relations: pd.DataFrame, paths: Arrays) -> Figure:
         (rows[printed], "#bbbbbb", -0.2, "whole log, as printed"),
     ):
         place = [methods.index(method) + shift for method in part.method]
-        right.barh(place, part.translation_mean_m, color=color, height=0.38, label=label)
+        right.plot(part.translation_mean_m, place, "o", ms=5, color=color, label=label)
         for y, mean in zip(place, part.translation_mean_m, strict=True):
-            right.text(mean * 1.1, y, f"{mean:.3f}", va="center", fontsize=7)
+            right.text(mean * 1.15, y, f"{mean:.3f}", va="center", fontsize=7)
+    right.grid(axis="y", lw=0.4)
     right.set_yticks(range(len(methods)), methods, fontsize=8)
     right.set(xscale="log", xlim=(0.02, 40.0), xlabel="mean translational error of relations, m")
     page.legend(*right.get_legend_handles_labels(), loc="outside lower right", fontsize=7)
@@ -71,30 +72,30 @@ def building(grids: Arrays) -> Figure:
 
 
 def mrclam(errors: pd.DataFrame, paths: Arrays) -> Figure:
-    """Errors and NEES of each robot, and the paths of robot 4."""
+    """Errors and NEES by method, a dot a robot, and the paths of robot 4."""
     page, (left, middle, right) = subplots(11.0, 4.6, 1, 3, width_ratios=[1.0, 1.0, 1.1])
-    robots, by_method = sorted(errors.robot.unique()), dict(list(errors.groupby("method")))
-    shown = [method for method in MRCLAM_SHOWN if method in by_method]
-    color_of = dict(zip(shown, (BLACK, *CYCLE[:-1], "#999999"), strict=False))
-    for i, (method, color) in enumerate(color_of.items()):
+    by_method = dict(list(errors.groupby("method")))
+    shown = [method for method in MRCLAM_SHOWN if method in by_method][::-1]
+    for k, method in enumerate(shown):
         rows = by_method[method].groupby("robot")
-        at = np.searchsorted(robots, list(rows.groups)) + (i - len(shown) / 2.0) * 0.09
-        left.plot(at, rows.ate_rmse_m.mean(), "o", ms=4, color=color, label=method)
-        middle.plot(at, rows.nees_mean.median(), "o", ms=4, color=color)
-    ticks = {"xticks": range(len(robots)), "xticklabels": [f"R{robot}" for robot in robots]}
-    left.set(
-        ylabel="position RMSE after 300 s, from the true start, m",
-        ylim=(0.0, None),
-        title="MRCLAM 6",
-        **ticks,
-    )
-    middle.set(yscale="log", ylabel="mean NEES (3 is consistent)", **ticks)
-    middle.axhline(3.0, color=BLACK, lw=0.7, ls=":")
-    for name in ("motion capture", *MRCLAM_DRAWN):
-        right.plot(*paths[name].T, color=color_of.get(name, BLACK), lw=0.8, label=name)
+        for ax, values in ((left, rows.ate_rmse_m.mean()), (middle, rows.nees_mean.median())):
+            at = k + np.linspace(-0.22, 0.22, len(values))
+            ax.plot(values, at, ".", ms=6, color=CYCLE[0])
+            ax.plot(np.median(values), k, "|", ms=16, mew=1.6, color=BLACK)
+    for ax in (left, middle):
+        ax.grid(axis="y", lw=0.4)
+        set_axes(ax, xscale="log", ylim=(-0.6, len(shown) - 0.4), yticks=range(len(shown)))
+    left.set_yticklabels(shown)
+    middle.set_yticklabels([])
+    left.set(xlabel="position RMSE after 300 s, m")
+    left.set_title("MRCLAM 6: a dot a robot, a bar the median", fontsize="medium")
+    middle.set(xlabel="mean NEES (dotted: 3, consistent)")
+    middle.axvline(3.0, color=BLACK, lw=0.9, ls=":")
+    plain_log(left.xaxis)
+    for color, name in zip((BLACK, *CYCLE), ("motion capture", *MRCLAM_DRAWN), strict=False):
+        right.plot(*paths[name].T, color=color, lw=0.8, label=name)
     plan_axes(right, title="robot 4")
-    page.legend(*left.get_legend_handles_labels(), loc="outside lower left", ncols=4, fontsize=7)
-    page.legend(*right.get_legend_handles_labels(), loc="outside lower right", fontsize=7)
+    page.legend(*right.get_legend_handles_labels(), loc="outside lower right", ncols=3, fontsize=7)
     return page
 
 

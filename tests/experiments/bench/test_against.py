@@ -1,14 +1,18 @@
 """Old and new code in turn: ratios with intervals, checkouts of revisions, and the verdict."""
 
+import itertools
 import json
+import math
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from experiments.bench import against
-from experiments.bench.against import alternate, checkout, git, run_in
+from experiments.bench.against import alternate, checkout, git, run_in, serving
 from experiments.bench.measure import Measurement, as_json, as_table
+from experiments.evaluation.statistics import Interval
 from experiments.gate import speed
 from sim.errors import InputError
 
@@ -32,36 +36,93 @@ def repository(tmp_path, monkeypatch):
 
 def stubbed(slowdown, rng, own=0.02):
     """Times of two figures on a machine that slows down meanwhile, beside other work."""
-    load = iter(np.linspace(1.0, 2.0, 100))
+    load = itertools.cycle(np.exp(np.linspace(0.0, 1.0, 100)))
 
-    def measure(folder):
-        shared = next(load)
-        noise = np.exp(own * rng.standard_normal(2))
+    def start(folder):
         planted = slowdown if folder == NEW else 1.0
-        return {"slow": shared * noise[0] * planted, "same": shared * noise[1], "none": 0.0}
 
-    return measure
+        def ask(_):
+            shared = next(load)
+            slow, same = shared * np.exp(own * rng.standard_normal(2))
+            same *= 1.5 if rng.random() < 0.1 else 1.0  # interrupted
+            return {"slow": slow * planted, "same": same, "none": 0.0}
+
+        return nullcontext(ask)
+
+    return start
 
 
 def test_a_planted_slow_step_is_red_and_equal_ones_are_not():
     red = []
     for seed in range(20):
         rng = np.random.default_rng(seed)
-        ratios = alternate(stubbed(1.3, rng), NEW, OLD)
+        ratios = alternate(stubbed(1.3, rng), ["suite"], NEW, OLD)
         assert set(ratios) == {"slow", "same"}
         assert 0.97 < ratios["same"].value < 1.03
         red.append(speed.slower(ratios))
-        assert not speed.slower(alternate(stubbed(1.05, rng), NEW, OLD))
+        assert not speed.slower(alternate(stubbed(1.05, rng), ["suite"], NEW, OLD))
+        assert alternate(stubbed(1.1, rng), ["suite"], NEW, OLD)["slow"].low > 1.0
     assert red == [["slow"]] * 20
     text = speed.as_text(ratios, "v1", ["mine"])
     assert "slower by more than 10 %: slow" in text
     assert "not at both: mine" in text
 
 
-def test_the_order_turns_with_each_pair():
-    order = []
-    alternate(lambda folder: order.append(folder) or {"a": 1.0}, NEW, OLD, pairs=3)
-    assert order == [OLD, NEW, NEW, OLD, OLD, NEW]
+def counted(own):
+    """How often an item of this noise is asked for at the new code, and in which order."""
+    order, rng = [], np.random.default_rng(0)
+
+    def start(folder):
+        def ask(_):
+            order.append(folder)
+            return {"a": math.exp(own * rng.standard_normal())}
+
+        return nullcontext(ask)
+
+    alternate(start, ["suite"], NEW, OLD)
+    return order.count(NEW), order
+
+
+def test_the_order_turns_and_noise_takes_more_turns():
+    calm, order = counted(0.0)
+    assert order[:6] == [OLD, NEW, NEW, OLD, OLD, NEW]
+    assert calm == against.ROUNDS * against._TURNS.start
+    assert calm < counted(0.05)[0] < counted(0.2)[0]
+    assert counted(1.0)[0] == against.ROUNDS * (against._TURNS.stop - 1)
+
+
+def test_processes_take_turns_wherever_they_look_at_the_clock(repository):
+    script = """
+def answer(item):
+    begun, n = time.process_time(), 0
+    while (past := time.perf_counter() - begun) < 0.05:
+        n += 1
+    return past
+"""
+    with serving(script, [], repository) as one, serving(script, [], repository) as other:
+        for _ in range(2):
+            given = [ask("x") for _ in range(10) for ask in (one, other)]
+            assert given == [None] * 20  # 17 slices of 3 ms, and both are under way
+            while (last := one("x")) is None:
+                pass
+            assert 0.05 <= last < 0.1  # what waiting takes does not count
+            while other("x") is None:
+                pass
+    with serving(script, [], repository, 0.0) as alone:
+        assert alone("x") >= 0.05
+
+
+def test_a_long_suite_takes_one_turn_a_round(monkeypatch):
+    monkeypatch.setattr(against, "_ROUND_S", 0.0)
+    assert counted(1.0)[0] == against.ROUNDS
+
+
+def test_what_a_revision_lacks_has_no_ratio():
+    def start(folder):
+        return nullcontext(lambda item: {item: 1.0} if (folder, item) != (OLD, "new") else {})
+
+    ratios = alternate(start, ["new", "both"], NEW, OLD)
+    assert ratios == {"both": Interval.exact(1.0)}
 
 
 def test_a_revision_is_checked_out_once(repository, capsys):
@@ -78,6 +139,17 @@ def test_a_revision_is_checked_out_once(repository, capsys):
             checkout(revision, repository)
     with pytest.raises(InputError, match="No module named 'gone'"):
         run_in(repository, "import gone")
+
+
+def test_a_process_answers_in_turn_until_it_fails(repository):
+    script = "import stated\nprint('loading')\nanswer = lambda item: [stated.number, int(item)]"
+    with serving(script, [], repository) as ask:
+        assert [ask("3"), ask("4")] == [[2, 3], [2, 4]]
+        with pytest.raises(InputError, match="invalid literal"):
+            ask("x")
+    gone = pytest.raises(InputError, match="No module named 'gone'")
+    with serving("import gone", [], repository) as ask, gone:
+        ask("3")
 
 
 def test_compiled_code_is_shared_if_all_of_it_is_equal(repository):
@@ -99,7 +171,7 @@ def test_compiled_code_is_shared_if_all_of_it_is_equal(repository):
 def test_ratios_stand_beside_the_figures(monkeypatch):
     figures = [{"name": "a.step_ms", "value": 2.0, "unit": "ms"}]
     monkeypatch.setattr(against, "checkout", lambda _: against.Checkout(OLD, "c"))
-    monkeypatch.setattr(against, "run_in", lambda *_: {"results": figures})
+    monkeypatch.setattr(against, "serving", lambda *_: nullcontext(lambda _: figures))
     (result,) = against.run_against("icp", "v1")
     assert (result.ratio, result.ratio_low, result.ratio_high) == (1.0, 1.0, 1.0)
     assert "1.000 (1.000 to 1.000)" in as_table([result])
@@ -116,13 +188,17 @@ def test_a_suite_gives_a_command_of_each_estimator(monkeypatch, tmp_path):
         f"first_seed: 7\nrecordings: {{a: {group}}}\n"
         "estimators: {odometry: {recordings: a, repeats: [1, 1]}}\n"
     )
-    seen = []
+    commands = speed.commands(speed.read_suite(path))
+    assert "seed=7" in commands["odometry"]
     monkeypatch.setattr(speed, "checkout", lambda _: against.Checkout(OLD, "c"))
     monkeypatch.setattr(
-        speed, "run_in", lambda *given: seen.append(given) or {"odometry": 1.0 + (given[0] != OLD)}
+        speed,
+        "serving",
+        lambda _, given, folder: nullcontext(
+            lambda item: {item: 1.0 + (folder != OLD)} if json.loads(given[0]) == commands else {}
+        ),
     )
     assert speed.run_speed(str(path), "v1")
-    assert "seed=7" in json.loads(seen[0][2])["odometry"]
-    monkeypatch.setattr(speed, "run_in", lambda *_: {})
+    monkeypatch.setattr(speed, "serving", lambda *_: nullcontext(lambda _: {}))
     with pytest.raises(InputError, match="none of odometry"):
         speed.run_speed(str(path), "v1")

@@ -9,6 +9,7 @@ import sys
 import numpy as np
 import pytest
 
+from experiments.cli.main import main
 from experiments.runs.store import write_run
 from sim.formats.carmen import write_carmen
 from sim.recording import save
@@ -118,10 +119,13 @@ def test_what_lies_among_the_rows_is_read_within_bounds(here, name, kind):
         (["run", "-m", *DRIVE, *BASIC, "keep=[],[particles]"], "keep decides no result"),
         (["run", *DRIVE, "robot.kr=1e300"], "the robot's motion is not finite; check robot.kr"),
         (["run", *DRIVE, "route.rest_s=1e308"], "route.rest_s last 1e+308 s"),
+        (["run", *QUICK, "route.distance_m=1e15"], "at most 100000"),
+        (["run", *DRIVE, "repeats=999999999"], "from 1 to 100000"),
         (["run", *DRIVE, "world=rooms", "world.n_x=1000000"], "2500 are the most"),
         (["run", *DRIVE, "world=streets", "world.n_x=1000000"], "2500 are the most"),
         (["run", *DRIVE, "world=rooms", "world.n_landmarks=10000000000"], "world.n_landmarks"),
         (["options", "study", "q", "--config-dir", "own"], "not UTF-8 text"),
+        (["report", "s", "--config-dir", "nope"], "--config-dir must name a folder"),
         (["view", "--map", "own/grid.yaml", "-o", "a.png"], "not a file"),
     ],
     ids=lambda words: words[-1] if isinstance(words, list) else "",
@@ -162,7 +166,7 @@ def test_code_of_ones_own_that_fails_is_named(here, monkeypatch, name):
     refused(called("run", *DRIVE, "estimator._target_=own_module.Own"), "own_module.Own")
 
 
-@pytest.mark.parametrize("target", ["..x", ".x", "x.", "os.path", "a b.c", "é.x"])
+@pytest.mark.parametrize("target", ["..x", ".x", "x.", "os.path", "a b.c", "é.x", "builtins.dict"])
 def test_a_target_that_names_nothing_is_refused(here, target):
     refused(called("run", *DRIVE, f"estimator._target_='{target}'"), target)
 
@@ -245,6 +249,37 @@ def test_streams_that_cannot_be_written(here, kind, number):
     assert int((here / "code").read_text()) in (0, 1), said.stderr
     assert "Traceback" not in said.stderr
     assert "Exception ignored" not in said.stderr
+
+
+def run_cli(monkeypatch, *arguments):
+    monkeypatch.setattr(sys, "argv", ["estima", *arguments])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    return ended.value.code
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("OMP_NUM_THREADS", "abc"),
+        ("OMP_NUM_THREADS", "0"),
+        ("OMP_NUM_THREADS", "4,2"),
+        ("SOURCE_DATE_EPOCH", "x"),
+        ("MPLBACKEND", "nonsense"),
+    ],
+)
+def test_an_environment_that_libraries_fail_at_is_named(name, value):
+    done = subprocess.run(
+        [sys.executable, "-m", "experiments.cli", "--version"],
+        capture_output=True, text=True, env={**os.environ, "PYTHONPATH": str(ROOT), name: value},
+    )  # fmt: skip
+    refused(done, name)
+
+
+def test_a_terminal_without_end_is_bounded(monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "99999999")
+    assert run_cli(monkeypatch, "--help") == 0
+    assert max(map(len, capsys.readouterr().out.splitlines())) <= 1000
 
 
 def test_a_folder_that_is_gone_is_named(here, monkeypatch):

@@ -127,6 +127,11 @@ def test_a_folder_without_a_submission_is_named(tmp_path):
         read_submission(tmp_path)
 
 
+def test_what_is_no_folder_to_write_is_named_before_anything_runs(folder, quick):
+    with pytest.raises(InputError, match=r"submission\.yaml: not a folder"):
+        check_submission(folder, folder / "submission.yaml", drives=1)
+
+
 @pytest.mark.slow
 def test_a_submission_passes_through_all_classes(folder):
     score, _ = check_submission(folder, drives=1, seed=12_345)

@@ -58,6 +58,8 @@ def test_a_wheel_has_no_tables_and_says_so(tmp_path, monkeypatch):
 def test_wrong_overrides_are_refused():
     with pytest.raises(InputError, match="leave the estimator out"):
         recommend(["estimator=mcl"])
+    with pytest.raises(InputError, match="leave the recording out: state its robot and sensors"):
+        recommend(["recording=a.npz"])
     with pytest.raises(InputError, match=r"robot\.kr must be"):
         recommend(["robot.kr=-1.0"])
 

@@ -342,6 +342,12 @@ def test_malformed_trajectories_end_in_one_line(files, tmp_path, monkeypatch, ca
     assert len(err.splitlines()) == 1
 
 
+def test_a_byte_order_mark_before_a_csv_is_passed_over(files, tmp_path):
+    plain, marked = files[0] / "est.csv", tmp_path / "est.csv"
+    marked.write_bytes(b"\xef\xbb\xbf" + plain.read_bytes())
+    assert np.array_equal(read_trajectory(marked).means, read_trajectory(plain).means)
+
+
 def test_messages_say_what_is_wrong(tmp_path):
     (tmp_path / "dir.tum").mkdir()
     (tmp_path / "cut.csv").write_bytes(MALFORMED["cut.csv"])

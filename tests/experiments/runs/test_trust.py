@@ -148,6 +148,11 @@ def test_a_study_from_elsewhere_runs_nothing(marker, tmp_path, monkeypatch, name
         make_plan([f"study={path}"])
     assert not marker.exists()
     if name == "estimator":
+        for value in ("", "0", "no", "false", "yes"):
+            monkeypatch.setenv("ESTIMA_TRUST", value)
+            with pytest.raises(InputError, match=REFUSED):
+                Experiment.compose([f"study={path}"])
+        assert not marker.exists()
         monkeypatch.setenv("ESTIMA_TRUST", "1")
         assert type(Experiment.compose([f"study={path}"]).estimator()).__name__ == "Odometry"
         assert marker.exists()

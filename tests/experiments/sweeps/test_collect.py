@@ -1,9 +1,12 @@
 """Rows of sweeps as tables, means and plots; the schema they share."""
 
+import itertools
+
 import numpy as np
 import pandas as pd
 import pytest
 from matplotlib.cbook import is_math_text
+from matplotlib.text import Text
 from typer.testing import CliRunner
 
 from experiments.cli.main import app
@@ -293,7 +296,7 @@ def test_plots_have_panels_and_twelve_series_that_differ():
     with pytest.raises(InputError, match="13 lines; at most 12"):
         sweep_figure(many(13), x, y, by, col="choice.world")
     both = sweep_figure(many(3), x, y, [by, "choice.world"])
-    assert "m00, v" in [text.get_text() for text in both.legends[0].get_texts()]
+    assert "m00, v" in [text.get_text() for text in both.axes[0].texts]
 
 
 def test_what_panels_say_the_legend_does_not_repeat():
@@ -339,9 +342,28 @@ def test_lines_are_named_at_their_ends_where_that_fits():
     page = sweep_figure(few, "estimator.n_particles", "ate_rmse_m", "choice.estimator")
     assert [text.get_text() for text in page.axes[0].texts] == ["m00", "m01", "m02"]
     assert not page.legends
-    few["ate_rmse_m"] = 1.0  # all ends in one place
+    few["ate_rmse_m"] = 1.0  # all ends in one place: the names are moved apart
+    page = sweep_figure(few, "estimator.n_particles", "ate_rmse_m", "choice.estimator")
+    page.draw_without_rendering()
+    boxes = [Text.get_window_extent(text) for text in page.axes[0].texts]
+    assert not any(a.overlaps(b) for a, b in itertools.combinations(boxes, 2))
+    few["choice.estimator"] += "_of_a_rather_long_name"
     page = sweep_figure(few, "estimator.n_particles", "ate_rmse_m", "choice.estimator")
     assert len(page.legends) == 1
+
+
+def test_long_words_stand_on_the_y_axis_the_best_at_the_top():
+    table = many(9).query("`choice.world` == 'w'")
+    table["choice.estimator"] += "_with_a_name"
+    page = sweep_figure(table, "choice.estimator", "ate_rmse_m", pool=True)
+    page.draw_without_rendering()
+    (ax,) = page.axes
+    means = np.log(table["ate_rmse_m"]).groupby(table["choice.estimator"]).mean()
+    names = [text.get_text() for text in ax.get_yticklabels()]
+    assert names == means.sort_values(ascending=False).index.tolist()
+    assert (ax.get_xlabel(), ax.get_ylabel()) == (title("ate_rmse_m"), "")
+    short = sweep_figure(many(3), "choice.estimator", "ate_rmse_m", pool=True).axes[0]
+    assert short.get_ylabel() == title("ate_rmse_m")
 
 
 @pytest.mark.parametrize(
@@ -438,7 +460,9 @@ def test_long_names_leave_the_axes_their_height_and_fit_a_column():
     (ax,), (legend,) = page.axes, page.legends
     assert ax.bbox.height / page.dpi > 1.4
     assert 0.0 <= legend.get_window_extent().x0 < legend.get_window_extent().x1 <= page.bbox.width
-    short = sweep_figure(many(5), "estimator.n_particles", "ate_rmse_m", by, size="column")
+    short = sweep_figure(
+        many(5), "estimator.n_particles", "ate_rmse_m", by[:1], col=by[1], size="column"
+    )
     assert short.legends[0]._ncols > 1
 
 

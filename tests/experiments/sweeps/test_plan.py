@@ -199,7 +199,11 @@ def option(folder_, text):
 
 @pytest.mark.parametrize(
     ("argument", "words"),
-    [("hydra.launcher.n_jobs=0", "or -1 for all"), ("+hydra.sweeper.params={}", "seed=1,2")],
+    [
+        ("hydra.launcher.n_jobs=0", "or -1 for all"),
+        ("hydra.launcher.n_jobs=999999999", "or -1 for all"),
+        ("+hydra.sweeper.params={}", "seed=1,2"),
+    ],
 )
 def test_a_sweeps_wrong_settings_of_hydra(argument, words):
     with pytest.raises(InputError, match=words):

@@ -69,6 +69,8 @@ def test_relations(tmp_path):
     np.testing.assert_array_equal(again.motion, found.motion)
     with pytest.raises(InputError, match=r"log:2: .* 8 numbers, this has 3"):
         relations.read_relations(words(b"1 2 3 4 5 6 7 8\n1 2 3\n"))
+    with pytest.raises(InputError, match=r"a trajectory \(\.tum\), not relations"):
+        relations.read_relations(words(b"1 2 3 0 0 0 0.6 0.8\n2 3 4 0 0 0 1 0\n"))
 
 
 def mrclam_folder(tmp_path, **changes):

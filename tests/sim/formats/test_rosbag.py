@@ -1,4 +1,5 @@
 import dataclasses
+import hashlib
 import json
 import math
 import sqlite3
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 
 from sim.errors import InputError
+from sim.formats import rosbag_topics
 from sim.formats.rosbag import ABOUT, Track
 from sim.formats.rosbag_in import read_bag, read_tracks
 from sim.formats.rosbag_out import covariance_6x6, write_bag
@@ -236,6 +238,20 @@ def test_a_scanner_mounted_upside_down(tmp_path):
     np.testing.assert_allclose(bearings, [-0.3, -0.1, 0.1, 0.3], atol=1e-6)
 
 
+@pytest.mark.parametrize("name", ["mine", "mine.bag", "mine.mcap", "mine.db3"])
+def test_a_folder_of_other_things_is_not_replaced(tmp_path, name):
+    folder, recording = tmp_path / name, fakes.circle(n_frames=5)
+    folder.mkdir()
+    (folder / "thesis.tex").write_text("kept")
+    with pytest.raises(InputError, match=r"a folder with \['thesis\.tex'\], not a bag"):
+        write_bag(folder, recording)
+    assert (folder / "thesis.tex").read_text() == "kept"
+    (folder / "thesis.tex").unlink()
+    for _ in range(2):  # an empty folder, and a bag
+        write_bag(folder, recording)
+        assert len(read_bag(folder).frame_stamps) == 5
+
+
 def test_refusals(tmp_path):
     with pytest.raises(InputError, match="no such bag"):
         read_bag(tmp_path / "absent.mcap")
@@ -276,12 +292,47 @@ def test_a_database_that_brings_a_program(tmp_path):
         read_bag(path)
 
 
+def flipped(data, at):
+    return data[:at] + bytes([data[at] ^ 1]) + data[at + 1 :]
+
+
 def test_a_flipped_bit_of_an_mcap_is_noticed(tmp_path):
     path = tmp_path / "run.mcap"
     write_bag(path, full_recording(), {})
     whole = path.read_bytes()
     end = whole.rindex(struct.pack("<BQ", 15, 4))  # of the data; an index follows
     for at in np.linspace(40, end - 1, 6).astype(int):
-        path.write_bytes(whole[:at] + bytes([whole[at] ^ 1]) + whole[at + 1 :])
+        path.write_bytes(flipped(whole, at))
         with pytest.raises(InputError, match="damaged or not a bag"):
             read_bag(path)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_damage_is_noticed_or_harmless(tmp_path, name):
+    path = tmp_path / name
+    write_bag(path, full_recording(), {})
+    right, n_refused = read_bag(path), 0
+    for file in path.iterdir() if path.is_dir() else [path]:
+        whole = file.read_bytes()
+        places = np.linspace(0, len(whole) - 1, 7).astype(int)
+        for damaged in [*(flipped(whole, at) for at in places), *(whole[:at] for at in places)]:
+            file.write_bytes(damaged)
+            try:
+                same(right, read_bag(path))
+            except InputError:
+                n_refused += 1
+        file.write_bytes(whole)
+    assert n_refused >= 10
+
+
+def test_messages_of_another_program_are_no_damage(tmp_path):
+    """Topics that are gone, or beside ours; but not one under another name."""
+    stated = {"/a": ["x", hashlib.sha256(b"1").hexdigest()], "/b": ["x", ""]}
+    read = {"/a": hashlib.sha256(b"1")}
+    for kinds in ({"/a": "x"}, {"/a": "x", "/b": "x", "/c": "x"}):
+        rosbag_topics._check_topics(tmp_path, stated, kinds, read)
+    for kinds in ({"/a": "x", "/B": "x"}, {"/a": "y", "/b": "x"}):
+        with pytest.raises(InputError, match=r"leave /estima/checksums out"):
+            rosbag_topics._check_topics(tmp_path, stated, kinds, read)
+    with pytest.raises(InputError, match="the messages of /a are not those that were written"):
+        rosbag_topics._check_topics(tmp_path, stated, {"/a": "x"}, {"/a": hashlib.sha256(b"2")})

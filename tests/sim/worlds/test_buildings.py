@@ -108,6 +108,12 @@ def test_faces_neither_cross_nor_coincide(name):
             assert not np.any(same_line & (overlap > 1e-6)), f"seed {seed}: face {i} is drawn twice"
 
 
+@pytest.mark.parametrize("seed", [965284705, 929370195])
+def test_objects_that_chance_leaves_no_room_are_placed_again(seed):
+    world = Experiment.compose(["world=clutter", f"seed={seed}"]).world()
+    assert world.name == "clutter"
+
+
 def _cross(a, b):
     return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
 
