@@ -358,7 +358,7 @@ def _name_lines(page: Figure, axes: Any, heading: str, size: Size, *, direct: bo
     handles = {label: handle for pair in found for handle, label in zip(*pair, strict=True)}
     beside = _characters(_DIRECT_SHARE * page.get_figwidth(), _FONT[size])
     if direct and axes.size == 1 and max(map(len, handles)) <= beside and _end_alike(page, handles):
-        name_ends(page, {label: handle.lines[0] for label, handle in handles.items()})
+        name_ends(page, axes[0, 0], {label: h.lines[0] for label, h in handles.items()})
         return
     most = _characters(0.9 * page.get_figwidth(), _FONT[size])  # of a line
     labels = [textwrap.fill(label, most) for label in handles]

@@ -238,7 +238,7 @@ def curves(trials: pd.DataFrame, gains: pd.DataFrame) -> Figure:
     right.set_yticks(-np.arange(len(gains)), gains["estimator"])
     plain_log(left.yaxis)
     plain_log(right.xaxis)
-    name_ends(page, lines)
+    name_ends(page, left, lines)
     return page
 
 

@@ -116,14 +116,13 @@ def with_legend(
     return page
 
 
-def name_ends(page: Figure, lines: Mapping[str, Line2D]) -> None:
+def name_ends(page: Figure, ax: Axes, lines: Mapping[str, Line2D]) -> None:
     """Write each line's name beside its last point, moved up or down where names would collide."""
     page.draw_without_rendering()
-    ax = next(iter(lines.values())).axes
-    assert ax is not None
-    ends = {n: ax.transData.transform(line.get_xydata()[-1]) for n, line in lines.items()}
+    last = {name: np.asarray(line.get_xydata(), float)[-1] for name, line in lines.items()}
+    ends = {name: ax.transData.transform(point) for name, point in last.items()}
     names = sorted(ends, key=lambda name: float(ends[name][1]))
-    apart = 1.3 * ax.xaxis.label.get_size() * page.dpi / 72.0
+    apart = 1.3 * float(ax.xaxis.label.get_fontsize()) * page.dpi / 72.0
     steps = apart * np.arange(len(names))
     placed = isotonic_regression(np.array([ends[name][1] for name in names]) - steps).x + steps
     placed += min(0.0, ax.bbox.y1 - placed[-1]) + max(0.0, ax.bbox.y0 - placed[0])
@@ -131,7 +130,7 @@ def name_ends(page: Figure, lines: Mapping[str, Line2D]) -> None:
     for name, height in zip(names, placed.tolist(), strict=True):
         colour, (x, y) = lines[name].get_color(), ends[name].tolist()
         ax.annotate(
-            name, lines[name].get_xydata()[-1], va="center", color=colour,
+            name, tuple(last[name].tolist()), va="center", color=colour,
             xytext=((right - x) * 72.0 / page.dpi + 14.0, (height - y) * 72.0 / page.dpi),
             textcoords="offset points",
             arrowprops={"arrowstyle": "-", "lw": 0.5, "color": colour, "shrinkA": 1.0},

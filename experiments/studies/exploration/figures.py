@@ -58,5 +58,5 @@ def by_distance(coverage: pd.DataFrame) -> Figure:
         xlabel="distance driven by each robot, m",
         ylabel="floor seen by the team, m²\n(median and quartiles over worlds)",
     )
-    name_ends(page, {str(line.get_label()): line for line in ax.lines[: len(_STRATEGIES)]})
+    name_ends(page, ax, {str(line.get_label()): line for line in ax.lines[: len(_STRATEGIES)]})
     return page
