@@ -201,7 +201,8 @@ def serving(
 
         def ask(item: str) -> Any:
             try:
-                print(item, file=asked, flush=True)
+                asked.write(f"{item}\n")
+                asked.flush()
                 return json.loads(answered.readline())
             except (OSError, ValueError):
                 child.kill()
