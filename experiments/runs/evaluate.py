@@ -161,8 +161,8 @@ def runner(
     Raises
     ------
     InputError
-        If the recordings are of more or fewer robots than the experiment, or lack what is known at
-        the start.
+        If there are more or fewer recordings than robots in the experiment, or they lack what is
+        known at the start.
     """
     experiment.check_size(read)
     priors = experiment.priors(read)

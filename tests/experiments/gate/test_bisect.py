@@ -77,7 +77,7 @@ def test_a_history_without_a_worsening_is_refused(repository):
 
 
 def named(kind, rise, seed, n_checks=None):
-    """Whether a drawn history's commit is named; all commits draw anew, as if each reseeded."""
+    """Whether a drawn history's commit is named; all commits draw again, as if each reseeded."""
     rng = np.random.default_rng([1000, seed])
     noise = material()[1][kind][0]
     culprit, n = int(rng.integers(1, N_COMMITS)), noise.shape[0]
