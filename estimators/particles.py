@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sim.arrays import Array, Ints
+from sim.compiled import njit
 from sim.errors import InputError
 
 Scheme = Literal["systematic", "stratified", "residual", "multinomial"]
@@ -62,11 +63,7 @@ def resample(
     """
     weights = normalize(log_weights)
     if scheme == "systematic":
-        # draws below each particle's end of the cumulated weights, all at once
-        ends = np.ceil(np.cumsum(weights) * n - rng.random())
-        ends[np.flatnonzero(weights)[-1] :] = n
-        copies = np.diff(np.clip(ends, 0, n), prepend=0.0).astype(np.int64)
-        return np.repeat(np.arange(len(weights)), copies)
+        return _one_in_each_stratum(weights, n, rng.random())
     if scheme == "stratified":
         return _at(weights, (np.arange(n) + rng.random(n)) / n)
     if scheme == "multinomial":
@@ -157,11 +154,34 @@ class Lineages:
         self._n_pruned = len(self._poses)
 
 
+@njit()
 def _distinct(rows: Ints, n_rows: int) -> tuple[Ints, Ints]:
     """Distinct ones of rows (M,) below `n_rows`, sorted, and the place of each row among them."""
-    taken = np.zeros(n_rows, bool)
-    taken[rows] = True
-    return np.flatnonzero(taken), (np.cumsum(taken) - 1)[rows]
+    place = np.zeros(n_rows, np.int64)
+    for row in rows:
+        place[row] = 1
+    distinct, found = np.empty(n_rows, np.int64), 0
+    for row in range(n_rows):
+        if place[row]:
+            distinct[found], place[row] = row, found
+            found += 1
+    return distinct[:found].copy(), place[rows]
+
+
+@njit()
+def _one_in_each_stratum(weights: Array, n: int, offset: float) -> Ints:
+    """Particles (n,) at the quantiles (k + offset) / n of normalised weights."""
+    drawn, last = np.empty(n, np.int64), len(weights) - 1
+    while weights[last] == 0.0:
+        last -= 1
+    cumulated, at = 0.0, 0
+    for particle in range(last):
+        cumulated += weights[particle]
+        while at < n and at < cumulated * n - offset:
+            drawn[at] = particle
+            at += 1
+    drawn[at:] = last
+    return drawn
 
 
 def _at(weights: Array, quantiles: Array) -> Ints:

@@ -322,9 +322,9 @@ def moments(poses: Array, weights: Array) -> tuple[Array, Array]:
 
 
 @njit(forceinline=True, **FLOATS)
-def _column(root: Array, k: int, cos: float, sin: float, stretch: float) -> _Vector:
-    """Column k of B, in `propose`."""
-    x, y, turn = stretch * root[0, k], stretch * root[1, k], stretch * root[2, k]
+def _stretched(column: _Vector, cos: float, sin: float, stretch: float) -> _Vector:
+    """A column of B, in `propose`, of the root's."""
+    x, y, turn = stretch * column[0], stretch * column[1], stretch * column[2]
     return cos * x - sin * y, sin * x + cos * y, turn
 
 
@@ -346,14 +346,17 @@ def propose(
     weight, p(x) / q(x), is
     exp(importance[0] / 2) / importance[1], `importance` (2, lanes).
     """
+    # read before the loop, as LLVM cannot know that writing `normals` leaves the root as it is
+    column0 = root[0, 0], root[1, 0], root[2, 0]
+    column1 = root[0, 1], root[1, 1], root[2, 1]
+    column2 = root[0, 2], root[1, 2], root[2, 2]
     for block in range(len(state)):
         S, first = state[block], block * LANES
         for j in range(LANES):
             lane = first + j
-            cos, sin = poses[3, lane], poses[4, lane]
-            wide = stretch[lane]
-            b0, b1 = _column(root, 0, cos, sin, wide), _column(root, 1, cos, sin, wide)
-            b2 = _column(root, 2, cos, sin, wide)
+            cos, sin, wide = poses[3, lane], poses[4, lane], stretch[lane]
+            b0, b1 = _stretched(column0, cos, sin, wide), _stretched(column1, cos, sin, wide)
+            b2 = _stretched(column2, cos, sin, wide)
             info = S[_IXX + j], S[_IXY + j], S[_IXT + j], S[_IYY + j], S[_IYT + j], S[_ITT + j]
             i0, i1, i2 = _times(info, b0), _times(info, b1), _times(info, b2)
             f, g, h = start[0, lane], start[1, lane], start[2, lane]

@@ -83,7 +83,7 @@ class ParticlePath:
         """Poses (5, lanes) after the motion; writes the state of a camera, by default its own."""
         mount = self._mount if mount is None else mount
         state = self.state if state is None else state
-        noise = self.stretch * normals
+        noise = normals if self._slip_dof is None else self.stretch * normals
         return ekf.move(self.poses, self.rolled.mean, self.root, noise, mount, state)
 
     def draw(self, rng: np.random.Generator) -> None:
