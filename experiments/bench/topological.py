@@ -8,9 +8,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from estimators.base import run as run_estimator
 from estimators.topological.topological_mcl import TopologicalMcl
-from experiments.bench.measure import Measurement
+from experiments.bench.measure import Measurement, time_steps
+from experiments.runs.evaluate import limit_blas
 from experiments.runs.experiment import Experiment
 
 PAPER_S = {
@@ -34,7 +34,7 @@ def run() -> Iterator[Measurement]:
 
 
 def node_s(experiment: Experiment, n_particles: int, *, paper: bool = True) -> float:
-    """Median time of a node with so many particles in all, over two runs of the route.
+    """Median processor time of a node with so many particles in all, over two runs of the route.
 
     By an experiment's filter, the paper's, or with the defaults. A first run compiles.
     """
@@ -46,6 +46,9 @@ def node_s(experiment: Experiment, n_particles: int, *, paper: bool = True) -> f
         if paper
         else TopologicalMcl(particles_per_node=per_node)
     )
-    rngs = map(np.random.default_rng, range(3))
-    runs = [run_estimator(estimator, recording, prior, rng).step_seconds for rng in rngs]
+    runs = []
+    with limit_blas():
+        for rng in map(np.random.default_rng, range(3)):
+            estimator.reset(prior, rng)
+            runs.append([seconds for seconds, _ in time_steps(estimator, recording.frames())])
     return float(np.median(runs[1:]))
