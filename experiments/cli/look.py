@@ -133,11 +133,12 @@ def view(
         ),
     ] = None,
     estimate: Annotated[
-        str | None,
+        list[str] | None,
         typer.Option(
             "--estimate",
             "-e",
-            help="A trajectory (.csv, .tum, .mcap), a run's folder, or an estimator to run now.",
+            help="A trajectory (.csv, .tum, .mcap), a run's folder, or an estimator to run now; "
+            "repeat it to see them over one another.",
             autocompletion=completion.estimators,
         ),
     ] = None,
@@ -173,7 +174,7 @@ def view(
 
       estima view --world world=office seed=3 -o office.png
 
-      estima view run.npz -e ekf_icp --map map.yaml -o run.html
+      estima view run.npz -e ekf_icp -e odometry --map map.yaml -o run.html
 
       estima view slip/1f0c33ab -o run.html (a run of the sweep slip)
 
@@ -196,12 +197,15 @@ def view(
     how = play.Showing(out, seconds, grid)
     if not Path(first).exists() and (row := row_of(first)) is not None:
         own = "a run of a sweep has its estimator and its settings; leave out others"
-        require(estimate is None and not overrides, f"{first}: {own}")
+        require(not estimate and not overrides, f"{first}: {own}")
         said = draw_recorded_run(row, how, first, config_dir)
     else:
-        ran = estimate is not None or not overrides
-        require(ran, f"{[*overrides, ''][0]}: overrides need an estimator; add --estimate NAME")
-        said = play.play_file(Path(first), estimate, [*searched(config_dir), *overrides], how)
+        ran = estimate or not overrides
+        require(
+            bool(ran), f"{[*overrides, ''][0]}: overrides need an estimator; add --estimate NAME"
+        )
+        given = [*searched(config_dir), *overrides]
+        said = play.play_file(Path(first), estimate or [], given, how)
     if said:
         print(said)
 

@@ -160,7 +160,7 @@ def draw_recorded_run(
     def estimated(shown: Playback, on_step: OnStep) -> Playback:
         return with_estimates_by(shown, again.experiment, again.repeat, on_step)
 
-    return play(again.recordings(), how, called, name, estimated)
+    return play(again.recordings(), how, called, [name], estimated)
 
 
 def _known(value: Any) -> bool:

@@ -2,6 +2,7 @@
 
 import itertools
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -35,6 +36,7 @@ from sim.recording import Recording
 Picture = NDArray[np.uint8]
 Points = dict[str, Array]  # (N, 2) m, in map, of each layer
 Bounds = tuple[float, float, float, float]  # x and y of the lower left and upper right corner, m
+OTHERS = (ORANGE, GREEN, PURPLE, SKY, YELLOW)  # colours of further estimates
 _MOST_PARTICLES = 1000  # drawn, of any number
 _SEEN_S = 1.0  # how long a sighting is shown
 _DPI = 100
@@ -136,6 +138,10 @@ def _layers_alone(own: RobotTrack, name: str) -> dict[str, Layer]:
         "believed robot": estimated and Layer("-", ESTIMATE, ""),
         "ellipse": estimated and Layer("-", ESTIMATE, "its 95 % ellipse", width=0.9),
     }
+    for k, (other, _) in enumerate(own.others):
+        colour = OTHERS[k % len(OTHERS)]
+        layers[f"other {k} estimate"] = Layer("--", colour, literal(other), width=1.3)
+        layers[f"other {k} ellipse"] = Layer("-", colour, "", width=0.9)
     return {f"0 {name}": layer for name, layer in layers.items() if layer}
 
 
@@ -156,6 +162,9 @@ def instants(run: Playback, around: Bounds) -> Iterator[tuple[Points, str]]:
             if len(path):
                 found["robot"] = robot_outline(own.truth_at(np.array([at]))[0], glyph_m)
             found |= _believed(own, at, glyph_m)
+            for k, (_, other) in enumerate(own.others):
+                theirs = _believed(replace(own, estimate=other), at, glyph_m)
+                found |= {f"other {k} {name}": there for name, there in theirs.items()}
             if len(run.robots) == 1:
                 found |= {name: sensor_points(own, name, at) for name in drawable(own.recording)}
             now = (when <= stamp + 1e-9) & (when > stamp - _SEEN_S)
@@ -166,9 +175,9 @@ def instants(run: Playback, around: Bounds) -> Iterator[tuple[Points, str]]:
 
 
 def _error_words(run: Playback, stamp: float) -> str:
-    """The position error of a robot alone, if it is known."""
+    """The position error of a robot alone, if it is known and the only one."""
     own = run.robots[0]
-    if len(run.robots) > 1 or own.belief_row(stamp) < 0:
+    if len(run.robots) > 1 or own.others or own.belief_row(stamp) < 0:
         return ""
     off = own.pose_at(stamp) - own.truth_at(np.array([stamp]))[0]
     return f", position error {np.hypot(*off[:2]):.3f} m" if np.isfinite(off).all() else ""
@@ -256,7 +265,7 @@ def _bounds(own: RobotTrack, run: Playback) -> tuple[Array, Array]:
             _NONE if run.grid is None else run.grid.corners_m,
         ]
     )
-    means = _NONE if own.estimate is None else own.estimate.means[:, :2]
+    means = np.concatenate([_NONE, *(each.means[:, :2] for each in own.estimates)])
     known, means = (points[np.isfinite(points).all(axis=1)] for points in (known, means))
     if len(known) and len(means):
         low, high = known.min(axis=0), known.max(axis=0)

@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Collection, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +17,31 @@ from experiments.trajectories.odometry import read_odometry_csv
 from experiments.trajectories.read import SUFFIXES as TRAJECTORIES
 from experiments.trajectories.read import read_trajectory
 from experiments.viewing.playback import Playback
-from sim.errors import require
+from sim.errors import require, required
 from sim.recording import Frame, Recording
 from sim.team import Team
 
 OnStep = Callable[[int], None]  # of the number of Frames done
 _EXTRAS = ("particles", "landmarks", "landmark_covariances")
+
+
+def with_all_estimates(
+    shown: Playback, sources: Sequence[str], overrides: Sequence[str], on_step: OnStep
+) -> Playback:
+    """Show the estimates of one source, and over them those of others: `with_estimates`."""
+    n_frames = sum(len(own.recording.frame_stamps) for own in shown.robots)
+    first, *others = [
+        with_estimates(shown, source, overrides, partial(_step_on, on_step, k * n_frames))
+        for k, source in enumerate(sources)
+    ]
+    names = [Path(source).name for source in sources]
+    tracks = [required(each.robots[0].estimate, "estimate") for each in others]
+    own = dataclasses.replace(first.robots[0], others=tuple(zip(names[1:], tracks, strict=True)))
+    return dataclasses.replace(first, robots=(own,), name=names[0]) if others else first
+
+
+def _step_on(on_step: OnStep, before: int, n: int) -> None:
+    on_step(before + n)
 
 
 def with_estimates(

@@ -10,7 +10,7 @@ from experiments.runs import paths
 from experiments.runs.console import progress
 from experiments.runs.experiment import Experiment
 from experiments.viewing import live, movie
-from experiments.viewing.estimates import OnStep, with_estimates
+from experiments.viewing.estimates import OnStep, with_all_estimates
 from experiments.viewing.grid import grid_figure
 from experiments.viewing.playback import FPS, Playback
 from experiments.viewing.style import save_figure
@@ -77,7 +77,7 @@ def play(
     team: Team,
     how: Showing,
     called: str,
-    name: str | None = None,
+    names: Sequence[str] = (),
     estimated: Callable[[Playback, OnStep], Playback] = lambda shown, _: shown,
 ) -> str:
     """Show a run; say what was written, or nothing of a window.
@@ -86,45 +86,53 @@ def play(
     ----------
     called
         What the run is called.
-    name
-        Of the estimates, or None for the recordings alone.
+    names
+        Of the estimates, drawn over one another; empty for the recordings alone.
     estimated
         Gives the playback with its estimates.
     """
+    many = "several estimates are drawn in files, of a robot alone; name one, such as run.html"
+    require(len(names) < 2 or (len(team) == 1 and how.out is not None), many)
     grid = None if how.grid is None else read_grid(how.grid)
     if how.out is None:
         require(len(team) == 1, "a team is drawn in files; name one, such as team.html")
         live.check_display()
-    shown = Playback.of(team, how.n_pictures(team.duration_s))
-    if name is not None:
-        with progress(name, sum(len(robot.frame_stamps) for robot in team.robots)) as on_step:
+    shown, label = Playback.of(team, how.n_pictures(team.duration_s)), _in_words(names)
+    if names:
+        n_steps = len(names) * sum(len(robot.frame_stamps) for robot in team.robots)
+        with progress(label, n_steps) as on_step:
             shown = estimated(shown, on_step)
     if how.out is None:
         live.watch(shown, how.seconds)
         return ""
     shown = replace(shown, grid=grid, seconds=how.length_s(team.duration_s))
-    title = called if name is None else f"{Path(name).name}: {called}"
+    title = f"{label}: {called}" if names else called
     with progress(f"drawing {how.out.name}", 1.0) as on_progress:
         movie.save(shown, how.out, on_progress, title)
     size = f"{len(shown.stamps)} pictures, {shown.seconds:.1f} s"
     return f"{paths.short(how.out)}: {size}, {shown.speed}"
 
 
-def play_file(log: Path, source: str | None, overrides: Sequence[str], how: Showing) -> str:
-    """Show a log, with the estimates of a `source` if it is given; see `play`.
+def play_file(log: Path, sources: Sequence[str], overrides: Sequence[str], how: Showing) -> str:
+    """Show a log, with the estimates of sources if they are given; see `play`.
 
     Parameters
     ----------
-    source, overrides
-        As for `viewing.estimates.with_estimates`.
+    sources, overrides
+        As for `viewing.estimates.with_all_estimates`.
     """
     return play(
         read_all([log]),
         how,
         log.name,
-        source,
-        lambda shown, on_step: with_estimates(shown, str(source), overrides, on_step),
+        sources,
+        lambda shown, on_step: with_all_estimates(shown, sources, overrides, on_step),
     )
+
+
+def _in_words(names: Sequence[str]) -> str:
+    short = [Path(name).name for name in names]
+    return " and ".join([", ".join(short[:-1]), short[-1]] if len(short) > 1 else short)
 
 
 def draw_world(overrides: Sequence[str], out: Path) -> Path:

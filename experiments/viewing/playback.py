@@ -16,10 +16,22 @@ FPS = 10
 
 @dataclass(frozen=True)
 class RobotTrack:
-    """A robot's recording, and beliefs or None; they have extras at the shown Frames."""
+    """A robot's recording, and beliefs or None; they have extras at the shown Frames.
+
+    Attributes
+    ----------
+    others
+        Estimates of the same drive to draw over it, by name, without their extras.
+    """
 
     recording: Recording
     estimate: Estimate | None = None
+    others: tuple[tuple[str, Estimate], ...] = ()
+
+    @property
+    def estimates(self) -> list[Estimate]:
+        """All of them, its own first."""
+        return [each for each in (self.estimate, *dict(self.others).values()) if each is not None]
 
     def belief_row(self, stamp: float) -> int:
         """Row of the last belief up to a time; -1 before the first, or without an estimate."""

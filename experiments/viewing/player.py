@@ -3,6 +3,7 @@
 import base64
 import html
 import io
+import itertools
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -10,11 +11,13 @@ from typing import Any
 
 import numpy as np
 
+from estimators.base import Estimate
 from experiments.evaluation.metrics import CHI2_95_2DOF
-from experiments.viewing.animation import Bounds, Layer, bounds, instants, layers
+from experiments.viewing.animation import OTHERS, Bounds, Layer, bounds, instants, layers
 from experiments.viewing.grid import grid_picture
 from experiments.viewing.playback import Playback, RobotTrack
-from experiments.viewing.style import ORANGE, PURPLE, WALL
+from experiments.viewing.style import ESTIMATE, ORANGE, PURPLE, WALL
+from experiments.viewing.team_figure import colour_of
 from experiments.viewing.world import sees_landmarks
 from sim.arrays import Array
 from sim.worlds.grid import OccupancyGrid
@@ -53,7 +56,7 @@ def write_page(
         "grid": None if run.grid is None else _underlay(run.grid),
         "still": _still(run),
         "layers": [_layer(name, layer, points[name], around) for name, layer in shown.items()],
-        "errors": [_errors(own, float(run.stamps[0])) for own in run.robots],
+        "errors": _errors(run),
     }
     text = json.dumps(data, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
     page = _PLAYER.read_text(encoding="utf-8")
@@ -132,15 +135,30 @@ def _underlay(grid: OccupancyGrid) -> dict[str, Any]:
     }
 
 
-def _errors(own: RobotTrack, start: float) -> dict[str, list[float | None]] | None:
-    """Position error and the semi-major axis of the 95 % ellipse over time; None if not known."""
-    if own.estimate is None or own.recording.truth is None:
-        return None
-    step = -(-len(own.estimate.stamps) // _MOST_ERRORS)
-    stamps = own.estimate.stamps[::step]
-    flat = own.estimate.means[::step, :2] - own.truth_at(stamps)[:, :2]
-    axes = np.linalg.eigvalsh(np.nan_to_num(own.estimate.covariances[::step, :2, :2], nan=-1.0))
-    known = np.isfinite(own.estimate.covariances[::step, :2, :2]).all(axis=(1, 2))
+def _errors(run: Playback) -> list[dict[str, Any]]:
+    """Curves of all estimates whose errors are known; those of a robot alone have names."""
+    start, alone = float(run.stamps[0]), run.robots[0]
+    if len(run.robots) > 1:
+        shown = [(own, "", own.estimate, colour_of(n)) for n, own in enumerate(run.robots)]
+    else:
+        named = [(run.name, alone.estimate), *alone.others]
+        colours = itertools.chain([ESTIMATE], itertools.cycle(OTHERS))
+        shown = [(alone, *each, colour) for each, colour in zip(named, colours, strict=False)]
+    return [
+        {"label": label, "colour": colour, **_curve(own, estimate, start)}
+        for own, label, estimate, colour in shown
+        if estimate is not None and own.recording.truth is not None
+    ]
+
+
+def _curve(own: RobotTrack, estimate: Estimate, start: float) -> dict[str, list[float | None]]:
+    """Position error and the semi-major axis of the 95 % ellipse over time."""
+    step = -(-len(estimate.stamps) // _MOST_ERRORS)
+    stamps = estimate.stamps[::step]
+    flat = estimate.means[::step, :2] - own.truth_at(stamps)[:, :2]
+    covariances = estimate.covariances[::step, :2, :2]
+    axes = np.linalg.eigvalsh(np.nan_to_num(covariances, nan=-1.0))
+    known = np.isfinite(covariances).all(axis=(1, 2))
     bound = np.where(known, np.sqrt(CHI2_95_2DOF * np.maximum(axes[:, 1], 0.0)), np.nan)
     return {
         "t": (stamps - start).round(4).tolist(),

@@ -19,7 +19,7 @@ from experiments.cli.main import app
 from experiments.trajectories.odometry import write_odometry_csv
 from experiments.viewing import live, movie
 from experiments.viewing.animation import ellipse_outlines, pictures, sensor_points
-from experiments.viewing.estimates import with_estimates
+from experiments.viewing.estimates import with_all_estimates, with_estimates
 from experiments.viewing.playback import Playback, RobotTrack
 from sim import se2
 from sim.errors import InputError
@@ -220,6 +220,38 @@ def test_html_plays_in_a_browser(run, tmp_path):
         assert tab.complaints() == []
 
 
+@pytest.mark.skipif(browser.find() is None, reason="no Chromium on this machine")
+def test_several_estimates_lie_over_one_another(recording, tmp_path):
+    truth = recording.truth_at(recording.frame_stamps)
+    off = believed(recording, truth + np.array([0.5, 0.0, 0.0]))
+    write_odometry_csv(off, tmp_path / "off.csv")
+    sources = [str(tmp_path / "off.csv"), "odometry"]
+    steps = []
+    shown = Playback.of(Team((recording,)), 4)
+    shown = with_all_estimates(shown, sources, [], steps.append)
+    assert steps[-1] == 2 * len(recording.frame_stamps)
+    assert [name for name, _ in shown.robots[0].others] == ["odometry"]
+    drawn = list(pictures(shown))
+    assert (drawn[-1] != list(pictures(without_others(shown)))[-1]).any()
+    movie.save(shown, tmp_path / "run.html", silent, "two")
+    with browser.page() as tab:
+        tab.open((tmp_path / "run.html").as_uri())
+        tab.js("stop(); show(last)")
+        assert "off.csv 0.500 m, odometry 0.0" in tab.js("$('time').textContent")
+        n = "document.querySelectorAll('#chart path').length"
+        assert tab.js(n) == 2
+        label = "[...document.querySelectorAll('#legend label')]"
+        tab.js(f"{label}.find((l) => l.textContent === 'off.csv').click()")
+        assert tab.js(n) == 1
+        assert "off.csv" not in tab.js("$('time').textContent")
+        assert tab.complaints() == []
+
+
+def without_others(shown):
+    own = dataclasses.replace(shown.robots[0], others=())
+    return dataclasses.replace(shown, robots=(own,))
+
+
 @pytest.mark.parametrize(
     ("drive_s", "seconds", "words"),
     [(62.0, 62.0, "real time"), (62.0, 20.0, "3.1 times real time"), (9.0, 20.0, "0.45 times")],
@@ -247,6 +279,7 @@ def test_from_the_command_line(recording, tmp_path, monkeypatch):
     for arguments, words in (
         ([log], "no display"),
         ([log, "-o", "run.avi"], ".mp4, .gif, .html"),
+        ([log, "-e", "odometry", "-e", "icp_odometry"], "several estimates are drawn in files"),
         ([log, "estimator.kr=1", "-o", out], "--estimate"),
         ([log, "-e", str(tmp_path / "kept"), "estimator.kr=1", "-o", out], "overrides"),
         ([log, "-o", out, "--seconds", "-1"], "seconds must"),
