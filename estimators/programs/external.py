@@ -19,6 +19,7 @@ from estimators.programs.program import (
     draw_seed,
     explain_mismatch,
     map_message,
+    start,
 )
 from sim.arrays import Array
 from sim.formats.trajectory import FARTHEST_M, sound_covariances
@@ -47,14 +48,18 @@ class External(ExternalOptions):
 
     program_seconds = 0.0
     _program: Program | None = None
+    _KIND = "a JSON object"  # of answers
 
     def reset(self, prior: Prior, rng: np.random.Generator) -> None:
         """Start the program, and tell it what is known."""
         message = {"type": "reset", **self._introduce(prior, rng)}
         if self._program is not None:
             self._program.close()
-        self._program, self._stamps = Program(self.words), list[float]()
+        self._program, self._stamps = self._start(), list[float]()
         self._ask(message, self.start_s, "reset")
+
+    def _start(self) -> Program:
+        return start(self.words)
 
     def _introduce(self, prior: Prior, rng: np.random.Generator) -> dict[str, Any]:
         """What is known at the start."""
@@ -115,7 +120,7 @@ class External(ExternalOptions):
             answer = None
         if not isinstance(answer, dict):
             shown = text[:60].decode(errors="replace")
-            raise self._wrong(f"answered {what} with {shown!r}, which is not a JSON object")
+            raise self._wrong(f"answered {what} with {shown!r}, which is not {self._KIND}")
         if answer.get("error") is not None:
             raise self._wrong(f"answered {what} with the error {str(answer['error'])[:300]}")
         return answer
@@ -125,8 +130,8 @@ class External(ExternalOptions):
         return orjson.dumps(message, option=orjson.OPT_SERIALIZE_NUMPY | orjson.OPT_APPEND_NEWLINE)
 
     @staticmethod
-    def _decode(line: bytes) -> Any:
-        return orjson.loads(line)
+    def _decode(data: bytes) -> Any:
+        return orjson.loads(data)
 
     def _numbers(self, answer: dict[str, Any], key: str, shape: tuple[int, ...]) -> Array:
         """Numbers of an answer, of a shape."""

@@ -1,26 +1,24 @@
 """An estimator in a process of its own, which never holds the truth: `isolated=true`.
 
 `Isolated` stands for it where the recording is, sends each Frame over a pipe and takes a belief
-back; `main` runs it at the other end. Both speak the lines of `external`, with arrays as their
-bytes, so that the results are those of an estimator in this process, to the last bit. What comes
-back is numbers and text: nothing is unpickled, and every array is checked.
+back; `main` runs it at the other end, in a fork of a clean process (`forked.py`). Arrays go as
+their bytes (`wire.py`), so that the results are those of an estimator in this process, to the last
+bit.
 """
 
-import base64
 import dataclasses
 import json
-import math
-import os
 import sys
 from collections.abc import Collection, Mapping
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
-import orjson
 
 from estimators.base import Belief, Estimate, Prior, read_belief
 from estimators.programs.external import External
-from estimators.programs.program import ProgramError
+from estimators.programs.forked import Forked
+from estimators.programs.program import Program, ProgramError
+from estimators.programs.wire import HEAD_BYTES, decode, encode, measure
 from estimators.topological.topological_map import TopologicalMap
 from sim.arrays import Values
 from sim.errors import InputError, printable, require
@@ -38,59 +36,7 @@ from sim.worlds.grid import OccupancyGrid
 from sim.worlds.world import World
 
 _MAPS = {kind.__name__: kind for kind in (World, OccupancyGrid, TopologicalMap)}
-_DTYPES = ("<f8", "<f4", "<i8", "<i4", "|u1", "|i1", "|b1")  # of the arrays that are sent
 _LIMIT_S, _BYTES = 3600.0, 1 << 28  # of an answer
-
-
-def encode(message: Mapping[str, Any]) -> bytes:
-    """A message as a line: JSON, whose arrays hold their bytes.
-
-    Raises
-    ------
-    TypeError
-        If it holds something else than plain values and arrays.
-    """
-    return orjson.dumps(message, default=_plain, option=orjson.OPT_APPEND_NEWLINE)
-
-
-def _plain(value: Any) -> dict[str, Any]:
-    array = np.asarray(value)
-    if array.dtype.str not in _DTYPES:
-        raise TypeError(f"a {type(value).__name__} is sent to no other process")
-    data = base64.b64encode(array.tobytes()).decode()
-    return {"dtype": array.dtype.str, "shape": list(array.shape), "data": data}
-
-
-def decode(line: bytes) -> dict[str, Any]:
-    """The message of a line; its arrays are read-only.
-
-    Raises
-    ------
-    ValueError
-        If it is none.
-    """
-    message = _restored(orjson.loads(line))
-    if not isinstance(message, dict):
-        raise ValueError("not a JSON object")
-    return message
-
-
-def _restored(part: Any) -> Any:
-    if isinstance(part, list):
-        return [_restored(item) for item in part]
-    if not isinstance(part, dict):
-        return part
-    if part.keys() != {"dtype", "shape", "data"}:
-        return {name: _restored(value) for name, value in part.items()}
-    kind, shape, data = part["dtype"], part["shape"], part["data"]
-    known = kind in _DTYPES and isinstance(shape, list) and isinstance(data, str)
-    if not known or not all(type(n) is int and n >= 0 for n in shape):
-        raise ValueError("an array without type, shape and bytes")
-    content = base64.b64decode(data, validate=True)
-    if len(content) != math.prod(shape) * np.dtype(kind).itemsize:
-        raise ValueError(f"an array of shape {shape} in {len(content)} bytes")
-    array: Values = np.ndarray(shape, kind, content or b"\0")
-    return array[()]  # of no axes: a number
 
 
 class Isolated(External):
@@ -105,14 +51,13 @@ class Isolated(External):
     """
 
     def __init__(self, settings: Mapping[str, Any], keep: Collection[str] = ()) -> None:
-        code = f"import sys; sys.path[:] = {sys.path!r}; import {__name__} as h; h.main()"
         super().__init__(
-            command=[sys.executable, "-c", code],
-            start_s=_LIMIT_S,
-            step_s=_LIMIT_S,
-            finish_s=_LIMIT_S,
+            command=[sys.executable], start_s=_LIMIT_S, step_s=_LIMIT_S, finish_s=_LIMIT_S
         )
         self._settings, self._keep = dict(settings), [*keep, "status"]
+
+    def _start(self) -> Program:
+        return Program("the estimator", Forked(main), measure)
 
     def _introduce(self, prior: Prior, rng: np.random.Generator) -> dict[str, Any]:
         """What is known at the start, and the generator."""
@@ -154,7 +99,8 @@ class Isolated(External):
         """Ask for the revised estimate, which there may be, and let the process end."""
         answer = self._ask({"type": "finish"}, self.finish_s, "finish")
         assert self._program is not None
-        self.program_seconds = self._program.close() - self._start_up_s
+        self.program_seconds = self._program.spent_s() - self._start_up_s
+        self._program.close(0.0)
         if answer.get("stamps") is None:
             return None
         if (kind := answer.get("kind")) not in ("online", "revised"):
@@ -177,6 +123,7 @@ class Isolated(External):
             raise InputError(printable(str(answer["refused"])))
         return answer
 
+    _KIND = "a message"
     _encode, _decode = staticmethod(encode), staticmethod(decode)
 
 
@@ -278,14 +225,12 @@ def _map_arrays(made: Any) -> Any:
     return {k: np.asarray(v) for k, v in made.items()} if isinstance(made, dict) else None
 
 
-def main() -> None:
-    """Answer line by line; what the estimator prints goes to standard error."""
-    answers = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)
+def main(asked: BinaryIO, answers: BinaryIO) -> None:
+    """Answer message by message."""
     host = Host()
-    for line in sys.stdin.buffer:
+    while begin := asked.read(HEAD_BYTES):
         try:
-            answer = encode(host.reply(decode(line)))
+            answer = encode(host.reply(decode(begin + asked.read(measure(begin) - HEAD_BYTES))))
         except Exception as error:
             refused = isinstance(error, InputError)
             text = str(error) if refused else f"{type(error).__name__}: {error}"

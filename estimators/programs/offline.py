@@ -15,13 +15,13 @@ import orjson
 from estimators.base import Belief, Estimate, Prior
 from estimators.programs.places import NAMES, fill, needs_of, places_in
 from estimators.programs.program import (
-    Program,
     ProgramError,
     ProgramOptions,
     Seconds,
     draw_seed,
     explain_mismatch,
     map_message,
+    start,
 )
 from sim import se2
 from sim.errors import InputError, require
@@ -109,7 +109,7 @@ class Offline(OfflineOptions):
         """Write the log, run the command, and read its trajectory."""
         with tempfile.TemporaryDirectory(prefix="estima-") as name:
             places = self._written(Path(name))
-            program = Program([fill(word, places) for word in self.words])
+            program = start([fill(word, places) for word in self.words])
             try:
                 program.wait(self.limit_s)
             finally:

@@ -14,10 +14,11 @@ import signal
 import subprocess
 import time
 import weakref
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import cached_property
-from typing import Annotated, Any
+from pathlib import Path
+from typing import Annotated, Any, Protocol
 
 import numpy as np
 from pydantic import Field
@@ -35,7 +36,7 @@ PEERS_PROGRAM = "build/peers/mrpt"  # of the estimators mrpt_*
 _TAIL = 2000  # bytes of its messages that are kept
 _CHUNK = 1 << 16
 _PATIENCE_S = 2.0  # to end by itself once its input is closed
-_ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 class ProgramError(Exception):
@@ -75,30 +76,94 @@ class ProgramOptions:
         return list(words)
 
 
-class Program:
-    """A child process.
+def environment() -> dict[str, str]:
+    """Variables of a program: none of this package's own, one thread unless more are set."""
+    own = {name: value for name, value in os.environ.items() if not name.startswith("ESTIMA_")}
+    return {**dict.fromkeys(ONE_THREAD, "1"), **own}
 
-    Parameters
-    ----------
-    words
-        The program and its arguments.
+
+class Process(Protocol):
+    """A process that leads a group of its own, with its pipes."""
+
+    stdin: Any
+    stdout: Any
+    stderr: Any
+    pid: int
+
+    def ended(self) -> int | None:
+        """Exit code; None if it still runs."""
+        ...
+
+    def end(self) -> float:
+        """End it with its group, however it goes; its processor time, s."""
+        ...
+
+
+class Started(subprocess.Popen[bytes]):
+    """A process that this one starts by a command.
+
+    Raises
+    ------
+    ProgramError
+        If it cannot be started.
     """
 
     def __init__(self, words: Sequence[str]) -> None:
-        self.name = os.path.basename(words[0])
-        environment = {k: v for k, v in os.environ.items() if not k.startswith("ESTIMA_")}
-        environment = {**dict.fromkeys(_ONE_THREAD, "1"), **environment}
+        pipe = subprocess.PIPE
         try:
-            self._process = subprocess.Popen(
+            super().__init__(
                 words,
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.PIPE,
+                stdin=pipe,
+                stdout=pipe,
+                stderr=pipe,
                 start_new_session=True,
-                env=environment,
+                env=environment(),
             )
         except (OSError, ValueError) as error:
-            raise ProgramError(f"{self.name} cannot be started ({error})") from error
+            name = os.path.basename(words[0])
+            raise ProgramError(f"{name} cannot be started ({error})") from error
+
+    def ended(self) -> int | None:
+        """Exit code, whether it is reaped or not; None if it still runs."""
+        if self.returncode is not None:
+            return self.returncode
+        found = os.waitid(os.P_PID, self.pid, os.WEXITED | os.WNOWAIT | os.WNOHANG)
+        if found is None:
+            return None
+        return found.si_status if found.si_code == os.CLD_EXITED else -found.si_status
+
+    def end(self) -> float:
+        """End it with its group, and reap it; its processor time, s."""
+        with suppress(ProcessLookupError, PermissionError):
+            os.killpg(self.pid, signal.SIGKILL)  # before it is reaped, while the number is its own
+        _, status, usage = os.wait4(self.pid, 0)
+        self.returncode = os.waitstatus_to_exitcode(status)
+        return usage.ru_utime + usage.ru_stime
+
+
+def measure_line(said: bytes | bytearray) -> int:
+    """Bytes of the line that begins here; 0 while its end is not there."""
+    return said.find(b"\n") + 1
+
+
+class Program:
+    """A child process that answers.
+
+    Parameters
+    ----------
+    name
+        What errors call it.
+    measure
+        Gives the bytes of the answer that begins here, or 0 while that is not known.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        process: Process,
+        measure: Callable[[bytes | bytearray], int] = measure_line,
+    ) -> None:
+        self.name, self._process, self._measure = name, process, measure
         pipes: Any = (self._process.stdin, self._process.stdout, self._process.stderr)
         self._stdin, self._stdout, self._stderr = (pipe.fileno() for pipe in pipes)
         self._selector = selectors.DefaultSelector()
@@ -109,8 +174,8 @@ class Program:
         self._said, self._messages = bytearray(), bytearray()
         self._finalizer = weakref.finalize(self, _end, self._process, 0.0)
 
-    def ask(self, line: bytes, limit_s: float, most_bytes: int) -> bytes:
-        """Write a line, and read the one line of the answer.
+    def ask(self, message: bytes, limit_s: float, most_bytes: int) -> bytes:
+        """Write a message, and read the one answer.
 
         Raises
         ------
@@ -121,10 +186,10 @@ class Program:
         self._read_ready(0.0)
         if self._said:
             raise self._error(f"wrote {_quoted(self._said)} without being asked")
-        unsent = self._written(memoryview(line))
-        while b"\n" not in self._said:
-            if len(self._said) > most_bytes:
-                raise self._error(f"wrote more than {most_bytes} bytes in one line")
+        unsent = self._written(memoryview(message))
+        while not 0 < (size := self._measure(self._said)) <= len(self._said):
+            if max(size, len(self._said)) > most_bytes:
+                raise self._error(f"wrote more than {most_bytes} bytes in one answer")
             left_s = deadline - time.monotonic()
             if left_s <= 0.0:
                 raise self._error(f"gave no answer within {limit_s:g} s")
@@ -137,9 +202,9 @@ class Program:
                 unsent = self._written(unsent)
                 if not unsent:
                     self._selector.unregister(self._stdin)
-        answer, _, rest = bytes(self._said).partition(b"\n")
+        answer, rest = bytes(self._said[:size]), self._said[size:]
         if rest:
-            raise self._error(f"wrote {_quoted(rest)} after its answer {_quoted(answer)}")
+            raise self._error(f"wrote {_quoted(rest)} after its answer {_quoted(answer.rstrip())}")
         self._said.clear()
         return answer
 
@@ -151,9 +216,9 @@ class Program:
         ProgramError
             If it does not end within the limit, or not with code 0.
         """
-        self._process.stdin.close()  # type: ignore[union-attr]
+        self._process.stdin.close()
         deadline = time.monotonic() + limit_s
-        while (code := _ended(self._process)) is None:
+        while (code := self._process.ended()) is None:
             if time.monotonic() > deadline:
                 raise self._error(f"did not end within {limit_s:g} s")
             if self._selector.get_map():
@@ -165,8 +230,20 @@ class Program:
             raise self._error("failed")
 
     def spent_s(self) -> float:
-        """Processor time that it has taken so far, s; without that of processes it started."""
-        return time.clock_gettime((~self._process.pid << 3) | 2)  # CPUCLOCK_SCHED of a process
+        """Processor time that it has taken so far, with processes that it waited for, s.
+
+        Raises
+        ------
+        ProgramError
+            If it has ended, or the system does not say.
+        """
+        pid = self._process.pid
+        try:
+            own_s = time.clock_gettime((~pid << 3) | 2)  # CPUCLOCK_SCHED of a process
+            said = Path(f"/proc/{pid}/stat").read_text(errors="replace").rpartition(")")[2]
+        except OSError as error:
+            raise self._error("does not say its processor time") from error
+        return own_s + sum(map(int, said.split()[13:15])) / os.sysconf("SC_CLK_TCK")
 
     def close(self, patience_s: float = _PATIENCE_S) -> float:
         """Let it end, with its whole process group; return the processor time that it took, s.
@@ -176,7 +253,7 @@ class Program:
         """
         self._selector.close()
         with suppress(OSError):
-            self._process.stdin.close()  # type: ignore[union-attr]
+            self._process.stdin.close()
         spent_s: float | None = self._finalizer.detach() and _end(self._process, patience_s)
         return spent_s or 0.0
 
@@ -204,7 +281,7 @@ class Program:
     def _error(self, what: str) -> ProgramError:
         """Error that says what went wrong, how the program ended, and its last message."""
         for _ in range(20):  # so that a crash is told as such
-            if (code := _ended(self._process)) is not None:
+            if (code := self._process.ended()) is not None:
                 what = f"ended with code {code}" if code >= 0 else f"was ended by signal {-code}"
                 break
             if what != "closed its output":
@@ -218,30 +295,27 @@ class Program:
         return ProgramError(f"{self.name} {what}{last}")
 
 
-def _ended(process: subprocess.Popen[bytes]) -> int | None:
-    """Exit code of a process that has ended and is not reaped; None while it runs."""
-    if process.returncode is not None:
-        return process.returncode
-    found = os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT | os.WNOHANG)
-    if found is None:
-        return None
-    return found.si_status if found.si_code == os.CLD_EXITED else -found.si_status
+def start(words: Sequence[str]) -> Program:
+    """Start a command.
+
+    Raises
+    ------
+    ProgramError
+        If it cannot be started.
+    """
+    return Program(os.path.basename(words[0]), Started(words))
 
 
-def _end(process: subprocess.Popen[bytes], patience_s: float) -> float:
-    """End a process and its group; return its processor time, s."""
+def _end(process: Process, patience_s: float) -> float:
+    """End a process and its group, if it does not end by itself; return its processor time, s."""
     deadline = time.monotonic() + patience_s
-    while _ended(process) is None and time.monotonic() < deadline:
+    while process.ended() is None and time.monotonic() < deadline:
         time.sleep(0.002)
-    with suppress(ProcessLookupError, PermissionError):
-        os.killpg(process.pid, signal.SIGKILL)  # before it is reaped, while the number is its own
-    _, status, usage = os.wait4(process.pid, 0)
-    process.returncode = os.waitstatus_to_exitcode(status)
+    spent_s = process.end()
     for pipe in (process.stdin, process.stdout, process.stderr):
-        if pipe is not None:
-            with suppress(OSError):
-                pipe.close()
-    return usage.ru_utime + usage.ru_stime
+        with suppress(OSError):
+            pipe.close()
+    return spent_s
 
 
 def _quoted(text: bytes | bytearray) -> str:

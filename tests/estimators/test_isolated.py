@@ -1,14 +1,21 @@
 """An estimator in a child process: the same bits, and nothing of the truth on the other side."""
 
+import struct
 import sys
+import time
+from pathlib import Path
 
+import numba
 import numpy as np
+import orjson
 import pytest
 
-from estimators.programs.host import Isolated, decode, encode
+from estimators.programs.host import Isolated
+from estimators.programs.wire import HEAD_BYTES, decode, encode, measure
 from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
 from sim.errors import InputError
+from tests.fixtures import fakes
 
 DRIVE = [
     "world=room",
@@ -20,13 +27,13 @@ DRIVE = [
 TIMES = {"isolated", "run_key", "step_time_us", "cpu_time_us"}
 
 MINE = """
-import os, sys
+import os, signal, subprocess, sys
 import numpy as np
 from estimators.base import Belief
 
 class Mine:
-    def __init__(self, kind="ok"):
-        self.kind = kind
+    def __init__(self, kind="ok", answer=(), noted=""):
+        self.kind, self.answer, self.noted = kind, bytes(answer), noted
     def reset(self, prior, rng):
         self.n, self.rng = 0, rng
         print("what it prints is not an answer")
@@ -35,6 +42,22 @@ class Mine:
             raise InputError("it takes no such map")
     def step(self, frame):
         self.n += 1
+        if self.n == 5 and self.kind == "writes":
+            frame = sys._getframe()
+            while "answers" not in frame.f_locals:
+                frame = frame.f_back
+            os.write(frame.f_locals["answers"].fileno(), self.answer)
+            import time
+            time.sleep(100.0)
+        if self.kind == "leaves":
+            assert self.n > 1 or not hasattr(np, "left")
+            np.left = os.environ["LEFT"] = "here"
+        if self.kind == "kills":
+            os.kill(os.getppid(), 9)
+            os._exit(0)
+        if self.kind == "stays" and self.n == 1:
+            sleeper = subprocess.Popen(["sleep", "100"])
+            open(self.noted, "w").write(f"{os.getpid()} {sleeper.pid}")
         if self.n == 5 and self.kind == "exits":
             os._exit(3)
         if self.n == 5 and self.kind == "raises":
@@ -74,6 +97,23 @@ def test_results_are_those_of_this_process(name):
                     assert np.array_equal(one, other)
 
 
+@pytest.fixture
+def own_method(tmp_path, monkeypatch):
+    """Function that gives the row of a run of `Mine`."""
+    monkeypatch.delitem(sys.modules, "my_own_method", raising=False)
+    (tmp_path / "my_own_method.py").write_text(MINE)
+    monkeypatch.syspath_prepend(tmp_path)
+    experiment = Experiment.compose([*DRIVE, "estimator=odometry", "isolated=true"])
+
+    def run(kind, **options):
+        settings = {"_target_": "my_own_method.Mine", "kind": kind, **options}
+        (row,) = evaluate(experiment.with_values(estimator=settings))
+        assert "my_own_method" not in sys.modules
+        return row
+
+    return run
+
+
 @pytest.mark.parametrize(
     ("kind", "status", "said"),
     [
@@ -84,17 +124,10 @@ def test_results_are_those_of_this_process(name):
         ("negative", "unsound", "positive semidefinite at"),
     ],
 )
-def test_code_from_elsewhere_runs_in_the_child_only(kind, status, said, tmp_path, monkeypatch):
-    monkeypatch.delitem(sys.modules, "my_own_method", raising=False)
-    experiment = Experiment.compose([*DRIVE, "estimator=odometry", "isolated=true"]).with_values(
-        estimator={"_target_": "my_own_method.Mine", "kind": kind}
-    )
-    (tmp_path / "my_own_method.py").write_text(MINE)
-    monkeypatch.syspath_prepend(tmp_path)
-    (row,) = evaluate(experiment)
+def test_code_from_elsewhere_runs_in_the_child_only(kind, status, said, own_method):
+    row = own_method(kind)
     assert (row["status_code"] or "ok") == status
     assert said in row["status_detail"]
-    assert "my_own_method" not in sys.modules
 
 
 def test_what_it_refuses_is_refused(tmp_path, monkeypatch):
@@ -114,63 +147,113 @@ def test_what_it_refuses_is_refused(tmp_path, monkeypatch):
         Experiment.compose(["study=teams", "sweeps=[]", "isolated=true"]).check()
 
 
-def test_a_line_holds_what_it_was_made_of():
+def test_a_message_holds_what_it_was_made_of():
     given = {
         "ranges": np.array([0.1, np.inf, np.nan], np.float32),
         "ids": np.zeros((0, 3), np.int64),
         "one": np.float64(0.1),
+        "columns": np.asfortranarray(np.arange(6.0).reshape(2, 3)),
         "inside": {"list": [1, "two", None]},
     }
-    back = decode(encode(given))
-    assert np.array_equal(back["ranges"], given["ranges"], equal_nan=True)
-    assert back["ranges"].dtype == np.float32
-    assert back["ids"].shape == (0, 3)
+    data = encode(given)
+    back = decode(data)
+    assert measure(data) == measure(data[:HEAD_BYTES]) == len(data)
+    assert measure(data[: HEAD_BYTES - 1]) == 0
     assert type(back["one"]) is np.float64
     assert back["inside"] == given["inside"]
+    for name in ("ranges", "ids", "columns"):
+        assert np.array_equal(back[name], given[name], equal_nan=True)
+        assert back[name].dtype == given[name].dtype
+        assert not back[name].flags.writeable
     with pytest.raises(TypeError):
         encode({"a": object()})
 
 
-@pytest.mark.parametrize(
-    "line",
-    [
-        b"[]",
-        b"nonsense",
-        b'{"a":{"dtype":"<f8","shape":[2],"data":""}}',
-        b'{"a":{"dtype":"<f8","shape":[-1],"data":""}}',
-        b'{"a":{"dtype":"|O","shape":[1],"data":"AAAAAAAAAAA="}}',
-        b'{"a":{"dtype":"<f8","shape":[true],"data":"AAAAAAAAAAA="}}',
-        b'{"a":{"dtype":"<f8","shape":[1],"data":"%%"}}',
-        b'{"a":{"dtype":["<f8"],"shape":[1],"data":"AAAAAAAAAAA="}}',
-        b'{"a":{"dtype":"<f8","shape":[99999999999999999999],"data":"AAAAAAAAAAA="}}',
-    ],
-)
-def test_lines_that_hold_something_else_are_refused(line):
+def test_frames_reach_the_child_as_they_are_here():
+    """Numba compiles for the layout too: other flags of an array would be other code."""
+    for frame in fakes.circle(n_frames=5, n_beams=11).frames():
+        there = decode(encode({"type": "frame", **vars(frame)}))
+        pairs = [(frame.wheel_increments_m, there["wheel_increments_m"])]
+        for name, reading in frame.readings.items():
+            pairs += [(values, there["readings"][name][key]) for key, values in reading.items()]
+        for here, sent in pairs:
+            assert here.tobytes() == sent.tobytes()
+            assert numba.typeof(here) == numba.typeof(sent)
+        assert there["stamp"] == frame.stamp
+
+
+def framed(text, data=b""):
+    return struct.pack("<QQ", len(text), len(data)) + text + data
+
+
+def array(**changed):
+    return orjson.dumps({"a": {"dtype": "<f8", "shape": [2], "order": "C", "at": 0} | changed})
+
+
+DAMAGED = [
+    b"",
+    b"short",
+    framed(b"[]"),
+    framed(b"nonsense"),
+    framed(array()),
+    framed(array(), bytes(16)) + b"more",
+    framed(array(), bytes(16))[:-1],
+    framed(array(shape=[-1]), bytes(16)),
+    framed(array(shape=[True]), bytes(16)),
+    framed(array().replace(b"[2]", b"[99999999999999999999]"), bytes(16)),
+    framed(array(dtype="|O"), bytes(16)),
+    framed(array(dtype=["<f8"]), bytes(16)),
+    framed(array(order="K"), bytes(16)),
+    framed(array(at=-8), bytes(16)),
+    framed(array(at=8), bytes(16)),
+    framed(array(at=4, shape=[1]), bytes(16)),
+    framed(array(at="0"), bytes(16)),
+]
+
+
+@pytest.mark.parametrize("data", DAMAGED)
+def test_messages_that_hold_something_else_are_refused(data):
+    assert decode(framed(array(), bytes(16)))["a"].tolist() == [0.0, 0.0]
     with pytest.raises(ValueError):  # noqa: PT011 of several kinds
-        decode(line)
+        decode(data)
 
 
 @pytest.mark.parametrize(
     ("answer", "said"),
     [
-        ('{"mean": 7}', "got shapes () and ()"),
-        ('{"mean": [0, 0, 0], "covariance": "none"}', "got shapes (3,) and ()"),
-        ("[]", "is not a JSON object"),
-        ('{"mean": {"dtype": "|O", "shape": [3], "data": ""}}', "is not a JSON object"),
+        (encode({"mean": 7}), "got shapes () and ()"),
+        (encode({"mean": [0, 0, 0], "covariance": "none"}), "got shapes (3,) and ()"),
+        (framed(b"[]"), "is not a message"),
+        (framed(array(dtype="|O"), bytes(16)), "is not a message"),
+        (b"what it prints, and more of it", "wrote more than"),
+        (encode({}) + b"more", "after its answer"),
     ],
 )
-def test_a_child_that_says_nonsense_fails(answer, said, tmp_path, monkeypatch):
-    child = tmp_path / "child"
-    child.write_text(
-        "#!/bin/sh\nwhile read -r line; do\n"
-        f"case $line in *frame*) echo '{answer}';; *) echo '{{}}';; esac\ndone\n"
-    )
-    child.chmod(0o755)
-    monkeypatch.setattr(sys, "executable", str(child))
-    experiment = Experiment.compose([*DRIVE, "isolated=true"])
-    try:
-        (row,) = evaluate(experiment)
-        complaint = row["status_detail"]
-    except InputError as error:  # of the first belief
-        complaint = str(error)
-    assert said in complaint
+def test_bytes_of_a_child_that_are_no_answer_end_in_one_line(answer, said, own_method):
+    row = own_method("writes", answer=list(answer))
+    assert said in row["status_detail"]
+    assert "\n" not in row["status_detail"]
+
+
+def test_no_run_sees_what_another_left(own_method):
+    first, second = own_method("leaves"), own_method("leaves")
+    assert (first["status"], second["status"]) == ("ok", "ok")
+    assert first["ate_rmse_m"] == second["ate_rmse_m"]
+
+
+def test_a_run_follows_a_server_that_was_killed(own_method):
+    assert own_method("kills")["status_code"] == "ProgramError"
+    assert own_method("ok")["status"] == "ok"
+    assert own_method("exits")["status_code"] == "ProgramError"
+    assert own_method("ok")["status"] == "ok"
+
+
+def test_a_child_that_does_not_end_is_ended_with_its_group(own_method, tmp_path):
+    noted = tmp_path / "noted"
+    row = own_method("stays", noted=str(noted))
+    assert row["status"] == "ok"
+    for pid in map(int, noted.read_text().split()):
+        deadline = time.monotonic() + 10.0
+        while Path(f"/proc/{pid}").exists() and time.monotonic() < deadline:
+            time.sleep(0.01)
+        assert not Path(f"/proc/{pid}").exists()

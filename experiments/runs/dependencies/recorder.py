@@ -23,7 +23,7 @@ from types import FrameType, ModuleType
 from typing import Any
 
 from experiments.runs.dependencies.digests import digest_of, name_of, package_version
-from experiments.runs.dependencies.sources import all_imports, keep_sources, read_source
+from experiments.runs.dependencies.sources import keep_sources, read_source, resolved
 from experiments.runs.paths import SOURCE
 
 Digests = Mapping[str, str]  # of each dependency, by its name
@@ -103,36 +103,34 @@ def note_unloaded(module: str, settings: Mapping[str, Any]) -> None:
         Its options; the files that they name count too.
     """
     found: dict[str, str] = {}
+
+    @functools.cache
+    def find(name: str) -> importlib.machinery.ModuleSpec | None:
+        """Spec of a module, without importing the packages that it is in."""
+        package = name.rpartition(".")[0]
+        above = find(package) if package else None
+        places = None if above is None else above.submodule_search_locations
+        if package and places is None:  # of a module that is not a package
+            return None
+        return importlib.machinery.PathFinder.find_spec(name, places)
+
     todo, seen = {module}, set[str]()
     while todo:
         name = todo.pop()
-        file = None if name in seen else _find_source(name)
+        spec = None if name in seen else find(name)
         seen.add(name)
-        if file is not None and not _is_installed(str(file)):
-            text = file.read_bytes()
-            found[name_of(file)] = read_source(text).digest
+        origin = (spec and spec.origin) or ""
+        if origin.endswith(".py") and not _is_installed(origin):
+            file = Path(origin)
+            found[name_of(file)], _, imports = read_source(file.read_bytes())
             package = name if file.name == "__init__.py" else name.rpartition(".")[0]
-            todo.update({name.rpartition(".")[0], *all_imports(text, package)} - {""})
+            todo.update({name.rpartition(".")[0], *resolved(imports, package)} - {""})
     for value in settings.values():
         for word in value if isinstance(value, list) else [value]:
             with suppress(OSError, ValueError):
                 if isinstance(word, str) and Path(word).is_file():
                     found[name_of(Path(word).absolute())] = digest_of(Path(word))
     note(found)
-
-
-def _find_source(module: str) -> Path | None:
-    """File of a module, without importing the packages that it is in."""
-    places, found = None, ""
-    for depth in range(1, module.count(".") + 2):
-        if depth > 1 and places is None:  # a module that is not a package
-            return None
-        part = ".".join(module.split(".")[:depth])
-        spec = importlib.machinery.PathFinder.find_spec(part, places)
-        if spec is None:
-            return None
-        places, found = spec.submodule_search_locations, spec.origin or ""
-    return Path(found) if found.endswith(".py") else None
 
 
 def note_part(name: str, digests: Digests, seconds: float) -> None:
@@ -321,16 +319,14 @@ def _code(modules: frozenset[str], _: int) -> tuple[dict[str, str], frozenset[st
             found[name_of(Path(file))], imports = _WATCH.loaded[module]
             package = name if hasattr(module, "__path__") else name.rpartition(".")[0]
             todo.update(_WATCH.imported.get(name, ()))
-            for each in imports:
-                with suppress(ImportError):
-                    todo.add(importlib.util.resolve_name(each, package))
+            todo |= resolved(imports, package)
     return found, frozenset(name for name in seen if _kind(name) != "library")
 
 
 def _source(file: Path) -> tuple[str, tuple[str, ...]]:
     """Digest and imports of a module's file."""
     with suppress(OSError):
-        return read_source(file.read_bytes()) if file.suffix == ".py" else (digest_of(file), ())
+        return read_source(file.read_bytes())[:2] if file.suffix == ".py" else (digest_of(file), ())
     return "", ()
 
 

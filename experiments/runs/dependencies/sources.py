@@ -9,7 +9,7 @@ import functools
 import hashlib
 import importlib.util
 import json
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -29,10 +29,13 @@ class Source(NamedTuple):
     imports
         Modules, and names that may be modules, that its import statements outside functions name;
         relative ones with their dots.
+    every
+        The same of all import statements.
     """
 
     digest: str
     imports: tuple[str, ...]
+    every: tuple[str, ...]
 
 
 def read_source(text: bytes) -> Source:
@@ -43,10 +46,13 @@ def read_source(text: bytes) -> Source:
         try:
             tree = ast.parse(text)
             imports = tuple(sorted(set(_imports(tree.body))))
+            kinds = ast.Import | ast.ImportFrom
+            nodes = (node for node in ast.walk(tree) if isinstance(node, kinds))
+            every = tuple(sorted(set(_imports(nodes))))
             said = ast.dump(_without_docstrings(tree)).replace(", type_params=[]", "")
-            known[key] = Source(hashlib.sha256(said.encode()).hexdigest()[:16], imports)
+            known[key] = Source(hashlib.sha256(said.encode()).hexdigest()[:16], imports, every)
         except (SyntaxError, ValueError, RecursionError):
-            known[key] = Source(key[:16], ())
+            known[key] = Source(key[:16], (), ())
     return known[key]
 
 
@@ -71,9 +77,9 @@ def _known(path: Path) -> _Known:
     known = _Known()
     with suppress(OSError, ValueError, TypeError, RecursionError):
         text = path.read_text() if path.is_file() else "{}"  # a pipe would wait forever
-        for key, (digest, imports) in json.loads(text).items():
-            if isinstance(digest, str) and all(isinstance(name, str) for name in imports):
-                known[key] = Source(digest, tuple(imports))
+        for key, (digest, imports, every) in json.loads(text).items():
+            if isinstance(digest, str) and all(isinstance(name, str) for name in imports + every):
+                known[key] = Source(digest, tuple(imports), tuple(every))
     known.kept = len(known)
     return known
 
@@ -86,24 +92,13 @@ def _without_docstrings(tree: ast.Module) -> ast.Module:
     return tree
 
 
-def all_imports(text: bytes, package: str) -> set[str]:
-    """Modules, and names that may be modules, of all import statements of a source.
-
-    Parameters
-    ----------
-    package
-        In which relative ones are found.
-    """
-    found: set[str] = set()
-    with suppress(SyntaxError, ValueError, RecursionError):
-        for node in ast.walk(ast.parse(text)):
-            if isinstance(node, ast.Import | ast.ImportFrom):
-                found |= set(_imports([node]))
-    resolved = set()
-    for name in found:
+def resolved(names: Iterable[str], package: str) -> set[str]:
+    """Imports of a source in this package, without their leading dots."""
+    found = set()
+    for name in names:
         with suppress(ImportError):
-            resolved.add(importlib.util.resolve_name(name, package))
-    return resolved
+            found.add(importlib.util.resolve_name(name, package))
+    return found
 
 
 def _is_docstring(node: Any) -> bool:
@@ -114,7 +109,7 @@ def _is_docstring(node: Any) -> bool:
     )
 
 
-def _imports(body: list[ast.stmt]) -> Iterator[str]:
+def _imports(body: Iterable[ast.stmt]) -> Iterator[str]:
     """What a module's statements import when it is loaded."""
     for node in body:
         if isinstance(node, ast.Import):
