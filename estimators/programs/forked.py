@@ -21,8 +21,6 @@ from typing import Any, BinaryIO
 
 from estimators.programs.program import ProgramError, environment
 
-_PRELOADED = ["estimators.programs.host", "scipy.linalg", "scipy.spatial"]
-
 Answer = Callable[[BinaryIO, BinaryIO], None]  # from what is asked to what is answered
 
 
@@ -33,6 +31,8 @@ class Forked:
     ----------
     answer
         Runs in the child, until nothing more is asked.
+    preload
+        Module of this package that the server imports as well, if it is not there yet.
 
     Raises
     ------
@@ -40,9 +40,9 @@ class Forked:
         If it cannot be started.
     """
 
-    def __init__(self, answer: Answer) -> None:
+    def __init__(self, answer: Answer, preload: str) -> None:
         context, variables = multiprocessing.get_context("forkserver"), environment()
-        context.set_forkserver_preload(_PRELOADED)
+        context.set_forkserver_preload([answer.__module__, preload])
         (asked, self.stdin), (self.stdout, answers), (self.stderr, complaints) = (
             context.Pipe(duplex=False) for _ in range(3)
         )

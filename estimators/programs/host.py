@@ -57,7 +57,9 @@ class Isolated(External):
         self._settings, self._keep = dict(settings), [*keep, "status"]
 
     def _start(self) -> Program:
-        return Program("the estimator", Forked(main), measure)
+        module = str(self._settings["_target_"]).rpartition(".")[0]
+        ours = module.startswith("estimators.")
+        return Program("the estimator", Forked(main, module if ours else __name__), measure)
 
     def _introduce(self, prior: Prior, rng: np.random.Generator) -> dict[str, Any]:
         """What is known at the start, and the generator."""

@@ -1,6 +1,8 @@
 """An estimator in a child process: the same bits, and nothing of the truth on the other side."""
 
+import os
 import struct
+import subprocess
 import sys
 import time
 from pathlib import Path
@@ -52,6 +54,11 @@ class Mine:
         if self.kind == "leaves":
             assert self.n > 1 or not hasattr(np, "left")
             np.left = os.environ["LEFT"] = "here"
+        if self.kind == "looks":
+            told = repr([sys.argv, sys.orig_argv, dict(os.environ), sys.modules["__main__"]])
+            for secret in ("4711", "ESTIMA_", "__main__.py"):
+                assert secret not in told, secret
+            assert "experiments" not in sys.modules
         if self.kind == "kills":
             os.kill(os.getppid(), 9)
             os._exit(0)
@@ -241,6 +248,13 @@ def test_no_run_sees_what_another_left(own_method):
     assert first["ate_rmse_m"] == second["ate_rmse_m"]
 
 
+def test_the_child_is_told_neither_the_command_line_nor_the_main_module(own_method, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["estima", "run", "seed=4711"])
+    monkeypatch.setenv("ESTIMA_SECRET", "1")
+    assert own_method("looks")["status_detail"] == ""
+    assert sys.argv[2] == "seed=4711"
+
+
 def test_a_run_follows_a_server_that_was_killed(own_method):
     assert own_method("kills")["status_code"] == "ProgramError"
     assert own_method("ok")["status"] == "ok"
@@ -248,12 +262,47 @@ def test_a_run_follows_a_server_that_was_killed(own_method):
     assert own_method("ok")["status"] == "ok"
 
 
-def test_a_child_that_does_not_end_is_ended_with_its_group(own_method, tmp_path):
-    noted = tmp_path / "noted"
-    row = own_method("stays", noted=str(noted))
-    assert row["status"] == "ok"
-    for pid in map(int, noted.read_text().split()):
+def wait_for_the_end(pids):
+    for pid in pids:
         deadline = time.monotonic() + 10.0
         while Path(f"/proc/{pid}").exists() and time.monotonic() < deadline:
             time.sleep(0.01)
         assert not Path(f"/proc/{pid}").exists()
+
+
+def test_a_child_that_does_not_end_is_ended_with_its_group(own_method, tmp_path):
+    noted = tmp_path / "noted"
+    row = own_method("stays", noted=str(noted))
+    assert row["status"] == "ok"
+    wait_for_the_end(noted.read_text().split())
+
+
+WAITS = """
+import os, subprocess, sys, time
+from estimators.programs.forked import Forked
+
+def answer(questions, answers):
+    sleeper = subprocess.Popen(["sleep", "100"])
+    answers.write(f"{os.getpid()} {os.getppid()} {sleeper.pid}".encode())
+    answers.close()
+    time.sleep(100.0)
+
+def main():
+    child = Forked(answer, "sim")
+    os.write(1, os.read(child.stdout.fileno(), 100))
+    os.read(0, 1)
+"""
+
+
+@pytest.mark.parametrize("killed", [True, False])
+def test_a_child_ends_with_its_group_when_its_parent_does(killed, tmp_path):
+    (tmp_path / "waits.py").write_text(WAITS)
+    code = f"import sys; sys.path[:] = {[str(tmp_path), *sys.path]}; import waits; waits.main()"
+    parent = subprocess.Popen(
+        [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    )
+    pids = os.read(parent.stdout.fileno(), 100).split()
+    assert len(pids) == 3
+    parent.kill() if killed else parent.communicate(b".")
+    parent.wait(10.0)
+    wait_for_the_end(pid.decode() for pid in pids)
