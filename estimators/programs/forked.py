@@ -76,7 +76,9 @@ class Forked:
 def _nothing_told(variables: Mapping[str, str]) -> Iterator[None]:
     """Start the server if need be, and hide what a new process is told of this one."""
     main, words, added = sys.modules["__main__"], sys.argv, variables.keys() - os.environ.keys()
+    method = multiprocessing.get_start_method(allow_none=True)
     sys.modules["__main__"], sys.argv = ModuleType("__main__"), []
+    multiprocessing.set_start_method("forkserver", force=True)  # joblib's own is unknown there
     try:
         os.environ.update({name: variables[name] for name in added})
         try:
@@ -87,6 +89,7 @@ def _nothing_told(variables: Mapping[str, str]) -> Iterator[None]:
         yield
     finally:
         sys.modules["__main__"], sys.argv = main, words
+        multiprocessing.set_start_method(method, force=True)
 
 
 def _become(

@@ -1,5 +1,6 @@
 """An estimator in a child process: the same bits, and nothing of the truth on the other side."""
 
+import multiprocessing
 import os
 import struct
 import subprocess
@@ -7,6 +8,7 @@ import sys
 import time
 from pathlib import Path
 
+import joblib.externals.loky.backend.context  # noqa: F401 gives multiprocessing its method
 import numba
 import numpy as np
 import orjson
@@ -253,6 +255,15 @@ def test_the_child_is_told_neither_the_command_line_nor_the_main_module(own_meth
     monkeypatch.setenv("ESTIMA_SECRET", "1")
     assert own_method("looks")["status_detail"] == ""
     assert sys.argv[2] == "seed=4711"
+
+
+def test_workers_of_joblib_isolate_too(own_method):
+    multiprocessing.set_start_method("loky", force=True)
+    try:
+        assert own_method("ok")["status"] == "ok"
+        assert multiprocessing.get_start_method() == "loky"
+    finally:
+        multiprocessing.set_start_method(None, force=True)
 
 
 def test_a_run_follows_a_server_that_was_killed(own_method):
