@@ -54,9 +54,10 @@ class Forked:
         except (OSError, EOFError) as error:
             raise ProgramError(f"no process can be forked for the estimator ({error})") from error
         atexit.register(self.end)  # before Python waits for it
+        assert self._process.pid is not None
+        self.pid = self._process.pid
         for pipe in (asked, answers, complaints):
             pipe.close()
-        self.pid: int = self._process.pid or 0
 
     def ended(self) -> int | None:
         """Exit code; None if it still runs."""
