@@ -14,7 +14,7 @@ import numpy as np
 from estimators.gaussian import Gaussian
 from sim.arrays import Array
 from sim.compiled import processor_s, wall_s
-from sim.errors import InputError, require, required
+from sim.errors import InputError, one_line, require, required
 from sim.formats.trajectory import FARTHEST_M, sound_covariances
 from sim.options import options
 from sim.recording import Frame, Recording
@@ -367,7 +367,8 @@ class Journal:
         for name, values in self._extras.items():
             values.append(belief.extras.get(name))
         if self._status == "ok" and belief.extras.get("status", "ok") != "ok":
-            self._status = f"{belief.extras['status']} at {frame.stamp:.2f} s"
+            said = one_line(str(belief.extras["status"]))
+            self._status = f"{said} at {frame.stamp:.2f} s"
         self._n_noted = i + 1
         if self._on_step is not None:
             self._on_step(i + 1)

@@ -24,10 +24,13 @@ class InputError(Exception):
     """
 
     def __init__(self, message: str) -> None:
-        text = printable(" ".join(message.splitlines()))
-        if len(text) > _BEGIN + _END:
-            text = f"{text[:_BEGIN]} ... {text[-_END:]}"
-        super().__init__(text)
+        super().__init__(one_line(message))
+
+
+def one_line(text: str) -> str:
+    """Make a text of somebody else's one printable line, cut in its middle if it is long."""
+    line = printable(" ".join(text.splitlines()))
+    return line if len(line) <= _BEGIN + _END else f"{line[:_BEGIN]} ... {line[-_END:]}"
 
 
 def printable(text: str) -> str:

@@ -58,6 +58,39 @@ def read_text(path: Path, most_bytes: int = 10_000_000) -> str:
         ) from error
 
 
+def check_writable(path: Path) -> None:
+    """Refuse a file that cannot be written, before anything is computed.
+
+    Raises
+    ------
+    InputError
+        As `write_whole` does.
+    """
+    part = _part_of(path)
+    with _writing(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        part.touch()
+        part.unlink()
+
+
+def _part_of(path: Path) -> Path:
+    """A file of this process beside the one that it will be."""
+    require(path.name and not path.is_dir(), f"{path or '.'}: a folder; name the file to write")
+    return path.with_name(f".{path.stem}.{os.getpid()}.{secrets.token_hex(4)}.part{path.suffix}")
+
+
+@contextmanager
+def _writing(path: Path) -> Iterator[None]:
+    """Turn an error of writing into one line."""
+    try:
+        yield
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot write ({error.strerror or error}); free some space or choose another "
+            "folder"
+        ) from error
+
+
 @contextmanager
 def write_whole(path: Path, *, durable: bool = True) -> Iterator[Path]:
     """Give a path beside `path` to write to; move it into place if all went well.
@@ -73,20 +106,15 @@ def write_whole(path: Path, *, durable: bool = True) -> Iterator[Path]:
     InputError
         If the file cannot be written: full disk, no permission, a folder in its place.
     """
-    require(path.name and not path.is_dir(), f"{path or '.'}: a folder; name the file to write")
-    part = path.with_name(f".{path.stem}.{os.getpid()}.{secrets.token_hex(4)}.part{path.suffix}")
+    part = _part_of(path)
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        yield part
-        with part.open("rb+") as written:
-            if durable:
-                os.fsync(written.fileno())
-        os.replace(part, path)
-    except OSError as error:
-        raise InputError(
-            f"{path}: cannot write ({error.strerror or error}); free some space or choose another "
-            "folder"
-        ) from error
+        with _writing(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            yield part
+            with part.open("rb+") as written:
+                if durable:
+                    os.fsync(written.fileno())
+            os.replace(part, path)
     finally:
         with suppress(OSError):
             part.unlink()

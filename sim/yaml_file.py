@@ -91,10 +91,11 @@ def _check(root: yaml.Node, path: Path) -> None:
             seen <= _MOST_NODES, f"{line}: its aliases (*) stand for more than {_MOST_NODES} values"
         )
         if isinstance(node, yaml.MappingNode):
-            keys = [key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
-            if len(set(keys)) < len(keys):
-                twice = next(key for i, key in enumerate(keys) if key in keys[:i])
-                raise InputError(f"{line}: the key {twice} is there twice; keep one")
+            names = set()
+            for key in (key for key, _ in node.value if isinstance(key, yaml.ScalarNode)):
+                there = f"{path}:{key.start_mark.line + 1}: the key {key.value} is there twice"
+                require(key.value not in names, f"{there}; keep one")
+                names.add(key.value)
             nodes += [(part, depth + 1) for pair in node.value for part in pair]
         elif isinstance(node, yaml.SequenceNode):
             nodes += [(part, depth + 1) for part in node.value]

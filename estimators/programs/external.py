@@ -22,12 +22,14 @@ from estimators.programs.program import (
     start,
 )
 from sim.arrays import Array
+from sim.errors import describe_unknown
 from sim.formats.trajectory import FARTHEST_M, sound_covariances
 from sim.options import options
 from sim.recording import Frame
 from sim.sensors.base import sensor_settings
 
 PROTOCOL = 1
+_KEYS = ("mean", "covariance", "status", "means", "covariances", "stamps")  # of answers
 _STEP_BYTES, _FINISH_BYTES = 1 << 20, 1 << 28  # of an answer
 
 
@@ -48,7 +50,6 @@ class External(ExternalOptions):
 
     program_seconds = 0.0
     _program: Program | None = None
-    _KIND = "a JSON object"  # of answers
 
     def reset(self, prior: Prior, rng: np.random.Generator) -> None:
         """Start the program, and tell it what is known."""
@@ -77,6 +78,7 @@ class External(ExternalOptions):
         message = {"type": "frame", **vars(frame)}
         answer = self._ask(message, self.step_s, f"the Frame at {frame.stamp:g} s")
         self._stamps.append(frame.stamp)
+        self._check_keys(answer)
         mean = self._numbers(answer, "mean", (3,))
         covariance = np.zeros((3, 3))
         if answer.get("covariance") is not None:
@@ -87,6 +89,7 @@ class External(ExternalOptions):
     def finish(self) -> Estimate | None:
         """Ask for a revised trajectory, which there may be, and let the program end."""
         answer = self._ask({"type": "finish"}, self.finish_s, "finish", _FINISH_BYTES)
+        self._check_keys(answer)
         found = None
         if answer.get("means") is not None:
             n = len(answer["means"]) if isinstance(answer["means"], list) else 0
@@ -110,6 +113,7 @@ class External(ExternalOptions):
         self, message: Any, limit_s: float, what: str, most_bytes: int = _STEP_BYTES
     ) -> dict[str, Any]:
         assert self._program is not None
+        self._asked = what
         try:
             text = self._program.ask(self._encode(message), limit_s, most_bytes)
         except ProgramError as error:
@@ -120,9 +124,9 @@ class External(ExternalOptions):
             answer = None
         if not isinstance(answer, dict):
             shown = text[:60].decode(errors="replace")
-            raise self._wrong(f"answered {what} with {shown!r}, which is not {self._KIND}")
+            raise self._wrong(f"got {shown!r}, which is not a JSON object")
         if answer.get("error") is not None:
-            raise self._wrong(f"answered {what} with the error {str(answer['error'])[:300]}")
+            raise self._wrong(f"the error {str(answer['error'])[:300]}")
         return answer
 
     @staticmethod
@@ -130,8 +134,13 @@ class External(ExternalOptions):
         return orjson.dumps(message, option=orjson.OPT_SERIALIZE_NUMPY | orjson.OPT_APPEND_NEWLINE)
 
     @staticmethod
-    def _decode(data: bytes) -> Any:
-        return orjson.loads(data)
+    def _decode(line: bytes) -> Any:
+        return orjson.loads(line)
+
+    def _check_keys(self, answer: dict[str, Any]) -> None:
+        for key in answer:
+            if key not in _KEYS:
+                raise self._wrong(describe_unknown(key, _KEYS))
 
     def _numbers(self, answer: dict[str, Any], key: str, shape: tuple[int, ...]) -> Array:
         """Numbers of an answer, of a shape."""
@@ -161,4 +170,4 @@ class External(ExternalOptions):
     def _wrong(self, what: str) -> ProgramError:
         assert self._program is not None
         self._program.close(0.0)
-        return ProgramError(f"{self._program.name} {what}")
+        return ProgramError(f"{self._program.name}, asked for {self._asked}: {what}")

@@ -125,7 +125,6 @@ class Isolated(External):
             raise InputError(printable(str(answer["refused"])))
         return answer
 
-    _KIND = "a message"
     _encode, _decode = staticmethod(encode), staticmethod(decode)
 
 

@@ -7,13 +7,14 @@ import numpy as np
 from experiments.calibration.from_log import LogCalibration, calibrate_log
 from sim.arrays import Array
 from sim.errors import InputError
-from sim.recording import Recording
+from sim.recording import Recording, WheelLog
 
 DELAY_S = 0.05  # a delay of the wheels above this is reported
 GAIN = 0.01  # so is a gain or scale that is this far from 1
 TURN = 0.02  # and a track that is this share off
 SIDEWAYS = 0.25  # share of the way; raw logs have up to 0.06, even of poses seconds apart
 _LONG_GAP = 20.0  # in median steps
+_JUMP, _JUMP_M = 10.0, 0.5  # of the wheels: times the speed of 95 % of the steps, and a step
 _DECIMALS = (0.001, 0.01, 0.1, 1.0)
 
 
@@ -39,6 +40,11 @@ def check_clocks(recording: Recording) -> list[str]:
         for ending, what in (
             ("_repeated", "repeat the stamp of another, and were dropped"),
             ("_backward", "were out of order, and were moved"),
+            ("_of_other_size", "have another number of beams than most, and were dropped"),
+            (
+                "_of_other_geometry",
+                "have other angles or another maximum range than most, and were dropped",
+            ),
         )
         if name.endswith(ending)
     ]
@@ -48,6 +54,7 @@ def check_clocks(recording: Recording) -> list[str]:
         clocks["truth"] = recording.truth.stamps
     for name, stamps in clocks.items():
         warnings += _clock(name, stamps)
+    warnings += _jumps(recording.wheels)
     share = notes.get("sideways_share", 0.0) if isinstance(notes, dict) else 0.0
     if isinstance(share, float) and share > SIDEWAYS:
         warnings.append(
@@ -55,6 +62,22 @@ def check_clocks(recording: Recording) -> list[str]:
             "poses look corrected by a mapper; give the raw log"
         )
     return warnings
+
+
+def _jumps(wheels: WheelLog) -> list[str]:
+    """Steps of the wheels that no robot takes."""
+    steps_m = np.abs(np.diff(wheels.position_m, axis=0)).max(axis=1)
+    speeds = steps_m / np.maximum(np.diff(wheels.stamps), 1e-3)
+    usual = float(np.quantile(speeds, 0.95)) if len(speeds) else 0.0
+    jumps = (steps_m > _JUMP_M) & (speeds > _JUMP * usual)
+    if not jumps.any():
+        return []
+    first, n = int(np.argmax(jumps)), int(jumps.sum())
+    return [
+        f"wheels: {n} jump{'s' * (n > 1)}, the first of {steps_m[first]:.3g} m at "
+        f"{wheels.stamps[first] - wheels.stamps[0]:.1f} s (usually up to {usual:.2g} m/s); was the "
+        "pose reset there?"
+    ]
 
 
 def _clock(name: str, stamps: Array) -> list[str]:

@@ -71,8 +71,10 @@ def run_arguments(arguments: Sequence[str], draw: Draw, out: Path | None = None)
         show(OmegaConf.to_yaml(found.cfg, resolve=line.resolved))
         return
     if found.cfg.get("sweeps") or found.params:
-        study = found.choices.get("study")
-        raise InputError(f"study={study} sweeps values; add -m: estima run -m study={study}")
+        raise InputError(
+            f"the configuration sweeps values (study={found.choices.get('study')}); add -m: "
+            f"estima run -m {shlex.join(line.overrides)}"
+        )
     experiment = Experiment(*found.resolve())
     run_once(experiment, draw, out)
     _say_next(experiment, line)

@@ -139,6 +139,12 @@ class Composer:
         """
         check_overrides(overrides)
         each = [self.parse(override) for override in overrides]
+        for override in each:
+            require(
+                not override.is_sweep_override(),
+                f"{override.input_line}: several values; add -m to run each, or quote a text that "
+                f"has commas: \"{override.key_or_group}='...'\"",
+            )
         for key in [o.key_or_group for o in each] if self._source is not None else ():
             require(not key.startswith("hydra"), f"{self._source}: {key} cannot be set by a file")
         options, plain = ([o for o in each if self.is_plain(o) == kind] for kind in (False, True))
@@ -333,13 +339,7 @@ def searched(config_dir: str | Path | None) -> list[str]:
     require("${" not in str(folder), f"{folder}: Hydra takes ${{ for a value; rename the folder")
     for group in (*GROUPS, "study"):
         for path in sorted((folder / group).rglob("*.yaml")):
-            option = read_yaml(path)  # within bounds, which Hydra does not know
-            option = {} if option is None else option
-            require(
-                isinstance(option, dict) and all(isinstance(key, str) for key in option),
-                f"{path}: an option holds keys and their values",
-            )
-            _check_hydra_of(path, option)
+            _check_option(path)
     return [f"{_SEARCHED}[{paths.quoted(f'file://{folder}')}]"]
 
 
@@ -365,6 +365,7 @@ def name_study_files(overrides: Sequence[str]) -> tuple[list[str], dict[Path, Pa
         if place.is_relative_to(own):
             named.append(f"study={place.relative_to(own).with_suffix('').as_posix()}")
             continue
+        _check_option(path)  # what is wrong is said of the file, not of its copy
         text = read_text(path)
         copies[path] = paths.results() / "cache" / "studies" / digest_of(path)[:16]
         write_text(copies[path] / "study" / path.name, text)
@@ -372,8 +373,17 @@ def name_study_files(overrides: Sequence[str]) -> tuple[list[str], dict[Path, Pa
     return named, copies
 
 
-def _check_hydra_of(path: Path, option: Mapping[str, Any]) -> None:
-    """Check that an option's file has none of Hydra's settings that nothing here reads."""
+def _check_option(path: Path) -> None:
+    """Check an option's file within bounds, which Hydra does not know.
+
+    It has none of Hydra's settings that nothing here reads.
+    """
+    option = read_yaml(path)
+    option = {} if option is None else option
+    require(
+        isinstance(option, dict) and all(isinstance(key, str) for key in option),
+        f"{path}: an option holds keys and their values",
+    )
     defaults = option.get("defaults")
     entries = [e for e in defaults if isinstance(e, dict)] if isinstance(defaults, list) else []
     set_here = [group for entry in entries for group in entry if "/hydra/" in str(group)]
@@ -443,8 +453,13 @@ def check_overrides(overrides: Sequence[str]) -> None:
                 scheme, _, place = str(getattr(entry, "text", entry)).rpartition("://")
                 there = scheme not in ("", "file") or Path(place).is_dir()
                 require(there, f"{override.input_line}: no folder {place}")
-        named = override.is_sweep_override() or isinstance(value, (str, list))
+        named = override.is_sweep_override() or isinstance(value, str)
+        listed = (
+            f"; for one run each, -m {key}={value[0]},..."
+            if isinstance(value, list) and value
+            else ""
+        )
         require(
             named or override.is_delete() or key not in (*GROUPS, "study"),
-            f"{override.input_line}: {key} must name one of `estima options {key}`",
+            f"{override.input_line}: {key} must name one of `estima options {key}`{listed}",
         )

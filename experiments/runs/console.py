@@ -156,7 +156,7 @@ def _say_system(error: OSError) -> NoReturn:
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # else Python tries again when it ends
     if error.errno == errno.EPIPE:  # whoever reads has seen enough
         sys.exit(1)
-    _say(f"the system says: {error.strerror or error}", 1)
+    _say(f"cannot write or read ({error.strerror or error}); is the output full or closed?", 1)
 
 
 def _in_defaults(error: BaseException) -> bool:

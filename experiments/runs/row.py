@@ -11,10 +11,10 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from experiments.runs.columns import DEPENDENCIES, ORIGIN, REPEAT, STATUS
-from sim.errors import InputError, printable, require
+from experiments.runs.columns import COLUMNS, DEPENDENCIES, ORIGIN, REPEAT, STATUS, Average
+from sim.errors import InputError, one_line, printable, require
 from sim.files import require_file, write_whole
 
 if TYPE_CHECKING:
@@ -25,6 +25,7 @@ Row = dict[str, str | int | float | bool | None]
 _TEXTS = (*STATUS, *ORIGIN, DEPENDENCIES)
 _KEY = re.compile(r"[0-9A-Za-z_-]{1,64}")  # it becomes the name of files
 WITH_DIGEST = re.compile(r".+\.([0-9a-f]{16})\.parquet")
+_LARGEST = 1e150  # of an error, so that its square is finite
 GAP = "gap"  # the code of a run that gave no pose for some of the drive
 
 
@@ -62,10 +63,10 @@ class Status:
     def of_error(cls, error: BaseException) -> Status:
         """Status of a run that an exception ended."""
         try:
-            text = " ".join(str(error).splitlines())
+            text = one_line(str(error))
         except Exception:  # its __str__ fails
             text = "its message cannot be read"
-        return cls(Outcome.FAILED, printable(type(error).__name__), printable(text))
+        return cls(Outcome.FAILED, printable(type(error).__name__), text)
 
     def columns(self) -> Row:
         """Return the columns of a row."""
@@ -109,11 +110,15 @@ def check_table(table: pd.DataFrame, path: Path) -> None:
     ------
     InputError
         If a run lacks a key that can name a file, a known status, an estimator, or a whole
-        number of its repeat.
+        number of its repeat; or if an error or a time is negative, or a text.
     """
     import pandas as pd
 
-    sound = {
+    def measured(column: pd.Series[Any]) -> pd.Series[bool]:
+        return column.isna() | pd.to_numeric(column, errors="coerce").between(0.0, _LARGEST)
+
+    metrics = [name for name, metric in COLUMNS.items() if metric.average is not Average.PLAIN]
+    sound = dict.fromkeys(metrics, measured) | {
         "run_key": lambda column: column.map(str).str.fullmatch(_KEY) & column.notna(),
         "status": lambda column: column.isin(_OUTCOMES),
         "choice.estimator": lambda column: column.notna(),
@@ -121,10 +126,12 @@ def check_table(table: pd.DataFrame, path: Path) -> None:
     }
     for name in sound.keys() & {*table}:
         good = sound[name](table[name])
+        bad = table[~good].head(1)
+        of = f" in run {bad['run_key'].iloc[0]}" if len(bad) and "run_key" in bad else ""
         require(
             good.all(),
-            f"{path}: not rows of runs, column {name} holds {table[name][~good].head(1).tolist()}; "
-            "delete the file, or run the sweep again",
+            f"{path}: not rows of runs, column {name} holds {bad[name].tolist()}{of}; delete the "
+            "file, or run the sweep again",
         )
 
 

@@ -22,6 +22,7 @@ from experiments.runs.row import Outcome, Row
 from experiments.runs.store import keep_dependencies, write_run
 from experiments.trajectories.convert import write_estimate
 from sim.errors import InputError, require
+from sim.files import check_writable
 from sim.recording import Recording
 from sim.team import Team, save
 
@@ -136,6 +137,7 @@ def expected_duration_s(experiment: Experiment) -> float | None:
 def record(experiment: Experiment, out: Path) -> bool:
     """Simulate what an experiment reads, save it and say so; return whether all drives were ok."""
     require(out.suffix == ".npz", f"{out}: a recording is an .npz file")
+    check_writable(out)
     with progress("simulated seconds", expected_duration_s(experiment)) as on_progress:
         made = experiment.simulate_team(on_progress)
     checksum = save(made, out)
@@ -167,6 +169,7 @@ _SHOWN = (
 _CONSISTENT = (1.5, 6.0)  # mean NEES of a run, half and twice the expected
 _CONSISTENCY = ("too cautious", "consistent", "too sure of itself")
 _DOF = 3
+_ALL = 0.99  # share of poses with a covariance, below which it is said
 
 
 def _print(rows: Sequence[Row], files: Sequence[Path]) -> None:
@@ -214,5 +217,7 @@ def summarize(rows: Sequence[Row]) -> str:
         words += f", {100.0 * error_m / distance_m:.2g} % of {distance_m:.3g} m"
     if math.isfinite(nees):
         kind = _CONSISTENCY[int(np.searchsorted(_CONSISTENT, nees))]
-        words += f"; {kind} (NEES {nees:.2g} of {_DOF})"
+        share = mean("nees_counted_share")
+        of_some = "" if not share < _ALL else f", by {100.0 * share:.2g} % of the poses"
+        words += f"; {kind} (NEES {nees:.2g} of {_DOF}{of_some})"
     return words

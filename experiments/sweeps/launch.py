@@ -82,7 +82,6 @@ def sweep(
     n_jobs = _n_jobs(launching)
     until, own = Until.of([a for a in arguments if a not in launching])
     plan = make_plan(own, config_dir)
-    require(len(plan.keys), f"no runs: a value of {' '.join(own)} is an empty range or list")
     plan = plan.name_by(own, config_dir)
     folder = plan.experiment(0).rows_folder
     require(

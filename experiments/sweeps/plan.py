@@ -293,6 +293,7 @@ def parse_swept(lines: Sequence[str]) -> dict[str, Sequence[Any]]:
             )
         else:
             choices[key] = _values(override, key)
+            require(len(choices[key]), f"{override.input_line}: no value; give one or more")
     return choices
 
 

@@ -15,6 +15,7 @@ from experiments.trajectories.odometry import (
 from experiments.trajectories.part import WHOLE, Part
 from experiments.trajectories.read import read_trajectory
 from sim.errors import InputError, require, required
+from sim.files import check_writable
 from sim.formats.detect import kind_of, read_any
 from sim.formats.mrclam import read_team
 from sim.formats.tum import write_tum
@@ -100,11 +101,13 @@ def write_estimate(
 
 
 def check_estimate_name(path: Path) -> None:
-    """Refuse a name that `write_estimate` could not write to, before anything is computed."""
+    """Refuse a file that `write_estimate` could not write, before anything is computed."""
     require(
         path.name and path.suffix in ESTIMATES,
         f"{path}: unknown ending {path.suffix!r}; known: {' '.join(filter(None, ESTIMATES))}",
     )
+    if path.suffix:
+        check_writable(path)
 
 
 def is_estimate(paths: Sequence[Path]) -> bool:

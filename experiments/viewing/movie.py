@@ -10,7 +10,7 @@ from experiments.viewing.animation import Picture, pictures
 from experiments.viewing.playback import Playback
 from experiments.viewing.player import write_page
 from sim.errors import require
-from sim.files import write_whole
+from sim.files import check_writable, write_whole
 
 
 def check_output(path: Path) -> None:
@@ -21,6 +21,7 @@ def check_output(path: Path) -> None:
         path.suffix != ".mp4" or shutil.which("ffmpeg") is not None,
         f"{path}: MP4 needs ffmpeg, which is not installed; take .gif or .html",
     )
+    check_writable(path)
 
 
 def save(

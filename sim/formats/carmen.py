@@ -105,7 +105,14 @@ def read_carmen(source: Path | Words) -> CarmenLog:
     if count_column == 8:
         remissions = words.whole(lines, after, "the number of remissions", 0, _MOST_BEAMS)
         tail = words.finite(lines, after + 1 + remissions, 12, "poses and stamp of ROBOTLASER1")
-        start, _, step, max_range = words.finite(lines[:1], 2, 4, "geometry of ROBOTLASER1")[0]
+        geometry = words.finite(lines, 2, 4, "geometry of ROBOTLASER1")
+        kinds, kind = np.unique(geometry, axis=0, return_inverse=True)
+        usual = int(np.bincount(kind.ravel()).argmax())
+        start, _, step, max_range = kinds[usual]
+        if len(kinds) > 1:
+            alike = kind.ravel() == usual
+            notes["scans_of_other_geometry"] = int(np.sum(~alike))
+            lines, ranges, tail = lines[alike], ranges[alike], tail[alike]
         if not (0.0 < step * n_beams < 2.1 * math.pi and 0.0 < max_range <= 1e4):
             raise words.error(int(lines[0]), "impossible resolution or maximum range")
     else:

@@ -232,8 +232,8 @@ def test_messages_that_hold_something_else_are_refused(data):
     [
         (encode({"mean": 7}), "got shapes () and ()"),
         (encode({"mean": [0, 0, 0], "covariance": "none"}), "got shapes (3,) and ()"),
-        (framed(b"[]"), "is not a message"),
-        (framed(array(dtype="|O"), bytes(16)), "is not a message"),
+        (framed(b"[]"), "is not a JSON object"),
+        (framed(array(dtype="|O"), bytes(16)), "is not a JSON object"),
         (b"what it prints, and more of it", "wrote more than"),
         (encode({}) + b"more", "after its answer"),
     ],

@@ -155,7 +155,11 @@ BAD = {
     ),
     "variance": (
         "print('{\"mean\": [0, 0, 0], \"covariance\": [[1,0,0],[0,-1,0],[0,0,1]]}', flush=True)",
-        "covariance, symmetric and without a negative variance",
+        r"Frame at [\d.]+ s: must answer with covariance, symmetric and without a negative",
+    ),
+    "misspelled": (
+        "print('{\"mean\": [0, 0, 0], \"covarience\": null}', flush=True)",
+        "unknown key covarience; known: covariance,",
     ),
     "error": ("print('{\"error\": \"no scan\"}', flush=True)", "the error no scan"),
     "two_lines": (f"print('{_BELIEF}\\n{_BELIEF}', flush=True)", "after its answer|being asked"),
@@ -184,6 +188,12 @@ def test_what_a_program_does_wrong_is_said_and_never_hangs(recording, tmp_path, 
     assert "\n" not in str(caught.value)
     assert time.monotonic() - begun < 15.0
     assert estimator._program._process.returncode is not None  # it was ended, and reaped
+
+
+def test_a_status_is_one_line(recording, tmp_path):
+    answer = '{"mean": [0, 0, 0], "status": "ok\\\\nestima: all is fine"}'
+    online, _ = run(External(command=child(tmp_path, f"print('{answer}', flush=True)")), recording)
+    assert online.status.startswith("ok estima: all is fine at ")
 
 
 def test_much_talk_on_standard_error_does_no_harm(recording, tmp_path):

@@ -45,14 +45,26 @@ def test_clocks():
     kept = (stamps < 30.0) | (stamps > 38.0)
     truth = Truth(stamps[kept], log.truth.poses[kept])
     odd = dataclasses.replace(
-        log, truth=truth, config={"notes": {"scans_repeated": 3, "scans_backward": 2}}
+        log,
+        truth=truth,
+        config={"notes": {"scans_repeated": 3, "scans_backward": 2, "scans_of_other_geometry": 4}},
     )
     text = "\n".join(check_log(odd))
     assert "scans: 3 readings repeat the stamp of another" in text
     assert "scans: 2 readings were out of order" in text
+    assert "scans: 4 readings have other angles" in text
     assert "truth: 1 gap, the longest 8.0" in text
     assert "wheels: stamps are whole steps of 0.01 s" in text
     assert "truth: stamps are whole steps" not in text
+
+
+def test_a_pose_that_was_reset_is_a_jump():
+    log = log_of(120.0).without("stereo")
+    assert not log_check._jumps(log.wheels)
+    stamps, position_m = log.wheels.stamps, log.wheels.position_m.copy()
+    position_m[len(stamps) // 2 :] += 500.0
+    (said,) = log_check._jumps(dataclasses.replace(log.wheels, position_m=position_m))
+    assert re.fullmatch(r"wheels: 1 jump, the first of 500 m at [\d.]+ s \(usually .*", said)
 
 
 @pytest.mark.parametrize("begin_s", [0.0, 1_700_000_000.0])

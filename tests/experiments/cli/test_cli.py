@@ -155,7 +155,9 @@ def test_a_run_prints_its_errors_and_leaves_a_row(tmp_path):
         (["name=../../x"], ["name", "one word"]),
         (["world.n_objects=-3"], ["objects", "zero or more"]),
         (["route.speed_mps="], ["route.speed_mps must be a positive number, got ''"]),
-        (["study=leaderboard"], ["-m study=leaderboard"]),
+        (["study=leaderboard"], ["add -m: estima run -m", " study=leaderboard"]),
+        (["sweeps=[{seed:[1,2]}]"], ["add -m: estima run -m", "sweeps="]),
+        (["-o", "/proc/none/est.tum"], ["/proc/none/est.tum: cannot write"]),
         (["robot.kq=1"], ["unknown key robot.kq", "robot.kr", "robot.track_m"]),
         (["estimator=nosuch"], ["no estimator named nosuch", "fastslam, ", "topological_mcl"]),
         (["robot=null"], ["robot=null", "estima options robot"]),
@@ -170,6 +172,12 @@ def test_bad_input_is_one_line_and_code_2(arguments, words):
     refused(called("run", *given, *arguments), *words)
 
 
+def test_errors_of_a_studys_file_name_it_and_not_its_copy(tmp_path):
+    path = tmp_path / "twice.yaml"
+    path.write_text("# @package _global_\nseed: 1\nseed: 2\n")
+    refused(called("run", f"study={path}"), f"{path}:3: the key seed is there twice")
+
+
 @pytest.mark.parametrize(
     ("override", "words"),
     [
@@ -178,7 +186,9 @@ def test_bad_input_is_one_line_and_code_2(arguments, words):
         ("estimator=3", "estimator=3.*estima options estimator"),
         ("route=null", "route=null.*estima options route"),
         ("estimator=null", "estimator=null.*estima options estimator"),
-        ("sensors=[]", "sensors is missing"),
+        ("sensors=[]", "sensors must name one"),
+        ("estimator=[odometry,ekf_icp]", "for one run each, -m estimator=odometry,"),
+        ("seed=1,2", "seed=1,2: several values; add -m"),
         ("~seed", "world_seed.*seed"),
         ("~prior.map", "prior.map is missing"),
         ("+sensors.laser=3", "sensors.laser must be a mapping"),

@@ -31,6 +31,9 @@ def test_errors_are_said_with_their_share_of_the_way_and_consistency():
     )
     assert summarize([a_row(), a_row(ate_rmse_m=0.4)]).startswith("position RMSE 0.354 m")
     assert "too sure of itself (NEES 9 of 3)" in summarize([a_row(nees_mean=9.0)])
+    some = summarize([a_row(nees_counted_share=0.074)])
+    assert some.endswith("consistent (NEES 3.2 of 3, by 7.4 % of the poses)")
+    assert "poses" not in summarize([a_row(nees_counted_share=1.0)])
     assert "too cautious" in summarize([a_row(nees_mean=0.5)])
     assert summarize([a_row(revised_ate_rmse_m=0.1)]).startswith(
         "revised path: position RMSE 0.1 m"

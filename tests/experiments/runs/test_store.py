@@ -179,6 +179,16 @@ def test_a_row_that_is_none_is_refused_wherever_it_is_read_or_written(tmp_path, 
     assert not list(store.journal_lines((tmp_path / "rows-b.journal").read_bytes()))
 
 
+@pytest.mark.parametrize("value", [-1.0, 1e300, np.inf, "much"])
+def test_an_error_that_no_run_can_have_is_refused(tmp_path, value):
+    rows = pd.DataFrame([row(1, ate_rmse_m=value), row(2, ate_rmse_m=value)])
+    rows.to_parquet(tmp_path / "rows-a.parquet")
+    with pytest.raises(InputError, match=r"column ate_rmse_m holds \[.* in run 0*1;"):
+        store.read_runs(tmp_path)
+    rows.assign(ate_rmse_m=[None, 0.1]).to_parquet(tmp_path / "rows-a.parquet")
+    assert store.read_runs(tmp_path)["ate_rmse_m"].sum() == 0.1
+
+
 def test_a_single_run_replaces_its_rows(tmp_path):
     for value in (1.0, 2.0):
         path = store.write_run([row(7, x=value)], tmp_path)

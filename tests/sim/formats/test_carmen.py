@@ -67,6 +67,17 @@ def test_scans_of_another_size_are_left_out():
     assert len(log.scan_stamps) == 3
 
 
+def test_scans_of_another_geometry_are_left_out():
+    lines = robotlaser_log().splitlines(keepends=True)
+    last = max(i for i, line in enumerate(lines) if line.startswith(b"ROBOTLASER1"))
+    words = lines[last].split(b" ")
+    for column in (2, 4, 5):  # start, resolution, maximum range
+        changed = [*words[:column], b"0.9", *words[column + 1 :]]
+        log = carmen(b"".join([*lines[:last], b" ".join(changed), *lines[last + 1 :]]))
+        assert log.notes["scans_of_other_geometry"] == 1
+        assert len(log.scan_stamps) == len(carmen(robotlaser_log()).scan_stamps) - 1
+
+
 @pytest.mark.parametrize(
     ("written", "reason"),
     [(b"0", "missing \\(all 0\\)"), (b"1.13486e+09", "too coarse, such as 1.13486e\\+09")],
