@@ -134,8 +134,8 @@ class External(ExternalOptions):
         return orjson.dumps(message, option=orjson.OPT_SERIALIZE_NUMPY | orjson.OPT_APPEND_NEWLINE)
 
     @staticmethod
-    def _decode(line: bytes) -> Any:
-        return orjson.loads(line)
+    def _decode(data: bytes) -> Any:
+        return orjson.loads(data)
 
     def _check_keys(self, answer: dict[str, Any]) -> None:
         for key in answer:
