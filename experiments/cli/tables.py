@@ -33,10 +33,11 @@ class Kept:
     ] = None
 
 
-def _rows(name: str, kept: Kept, times: bool) -> DataFrame:
+def _rows(name: str, kept: Kept, times: bool, running: bool = False) -> DataFrame:
     from experiments.sweeps.collect import collect, where
 
-    return where(collect(name, all_versions=kept.all_versions, times=times), kept.only or [])
+    rows = collect(name, all_versions=kept.all_versions, times=times, running=running)
+    return where(rows, kept.only or [])
 
 
 @dataclass(frozen=True)
@@ -206,6 +207,10 @@ def report(
             "--pictures", help="Draw the best and worst run of each estimator as they move."
         ),
     ] = False,
+    follow: Annotated[
+        bool,
+        typer.Option("--follow", help="Write it again as rows come, until the sweep has ended."),
+    ] = False,
     *,
     kept: Kept,
     config_dir: ConfigDir = None,
@@ -224,19 +229,25 @@ def report(
 
       estima report slip --pictures
 
+      estima report slip --follow (beside the sweep, in another terminal)
+
       estima report slip --where choice.world=office -o office.html
     """
     from experiments.report import of_sweep
 
     if name is not None:
         require(out is None or out.suffix == ".html", f"-o {out}: a page is .html")
+        if follow:
+            require(not pictures, "--pictures: of a sweep that has ended; leave out --follow")
+            show(of_sweep.follow(lambda: _rows(name, kept, True, running=True), name, out))
+            return
         rows = _rows(name, kept, times=True)
         show(of_sweep.page_of(rows, name, out, config_dir, pictures=pictures))
         return
     require(out is None, f"-o {out} is for the page of a sweep: estima report NAME -o {out}")
     require(
-        not (kept.only or kept.all_versions or pictures or config_dir),
-        "--where, --all-versions, --pictures, --config-dir: name the sweep of the runs",
+        not (kept.only or kept.all_versions or pictures or follow or config_dir),
+        "--where, --all-versions, --pictures, --follow, --config-dir: name the sweep of the runs",
     )
     print(of_sweep.page_of_papers())
 

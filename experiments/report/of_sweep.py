@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -17,12 +19,14 @@ from experiments.runs import paths
 from experiments.runs.console import pluralize, progress, show, warn
 from experiments.runs.row import Outcome, write_frame
 from experiments.sweeps.again import draw_recorded_run, short_key
-from experiments.sweeps.collect import folder_of, suggest_axes
+from experiments.sweeps.collect import folder_of, suggest_axes, unfinished_sweeps
 from experiments.sweeps.summary import summary
 from experiments.sweeps.winner import find_winner
 from experiments.viewing.play import Showing
 from experiments.viewing.style import save_figure
 from sim.errors import InputError, require
+
+FOLLOW_S = 5.0  # how often a page of a running sweep is written again
 
 
 def write_rows(rows: pd.DataFrame, out: Path) -> str:
@@ -91,8 +95,27 @@ def plot_of(rows: pd.DataFrame, name: str, panels: Panels, out: Path) -> Panels:
     return panels
 
 
+def follow(read: Callable[[], pd.DataFrame], name: str, out: Path | None) -> str:
+    """Write a sweep's page again and again until the sweep has ended; return its path."""
+    n_rows = -1
+    while unfinished_sweeps(folder_of(name)):
+        with suppress(InputError):  # no row yet, or none with a result
+            if len(rows := read()) != n_rows:
+                n_rows = len(rows)
+                page = page_of(rows, name, out, None, pictures=False, refresh_s=FOLLOW_S)
+                warn(f"{page}: {pluralize(n_rows, 'row')}")
+        time.sleep(FOLLOW_S)
+    return page_of(read(), name, out, None, pictures=False)
+
+
 def page_of(
-    rows: pd.DataFrame, name: str, out: Path | None, config_dir: Path | None, *, pictures: bool
+    rows: pd.DataFrame,
+    name: str,
+    out: Path | None,
+    config_dir: Path | None,
+    *,
+    pictures: bool,
+    refresh_s: float | None = None,
 ) -> str:
     """Write a sweep's page, and on request pictures of its extreme runs; return its path."""
     folder, called = folder_of(name), Path(name).name
@@ -100,7 +123,7 @@ def page_of(
     called = called if folder.parent == paths.results() / "runs" else name
     if pictures:
         _draw_extremes(rows, str(folder), called, written, config_dir)
-    write_sweep_page(rows, called, folder, written, config_dir)
+    write_sweep_page(rows, called, folder, written, config_dir, refresh_s)
     return paths.short(written)
 
 

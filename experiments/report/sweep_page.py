@@ -52,7 +52,12 @@ _SHOWN_RUNS = 3  # of an estimator, best, worst and failed
 
 
 def write_sweep_page(
-    table: pd.DataFrame, name: str, folder: Path, out: Path, config_dir: Path | None = None
+    table: pd.DataFrame,
+    name: str,
+    folder: Path,
+    out: Path,
+    config_dir: Path | None = None,
+    refresh_s: float | None = None,
 ) -> None:
     """Write the page of a sweep's rows, as `collect` gives them with their times.
 
@@ -66,6 +71,8 @@ def write_sweep_page(
         Where the rows lie, for the command that made them.
     config_dir
         Folder with your own options, for the commands that draw runs; by default the sweep's.
+    refresh_s
+        How often the page loads itself again; by default never.
 
     Raises
     ------
@@ -101,6 +108,7 @@ def write_sweep_page(
         name=name,
         called=shlex.quote(name),
         n_runs=len(table),
+        refresh_s=refresh_s and f"{refresh_s:g}",
         unfinished=unfinished_sweeps(folder),
         answer=found_winner.sentences() if (found_winner := find_winner(table)) else [],
         decided=decided and {**decided, "metric": titled(decided["metric"])},

@@ -36,7 +36,9 @@ DRAWN = ("seed", "world_seed")  # settings that only draw other samples
 _NAMED = 12  # columns that a message names
 
 
-def collect(name: str, *, all_versions: bool = False, times: bool = False) -> pd.DataFrame:
+def collect(
+    name: str, *, all_versions: bool = False, times: bool = False, running: bool = False
+) -> pd.DataFrame:
     """Read all rows of results/runs/NAME, or of a folder or file.
 
     Parameters
@@ -47,6 +49,8 @@ def collect(name: str, *, all_versions: bool = False, times: bool = False) -> pd
         Keep the rows of other versions of the code; by default they are dropped with a warning.
     times
         Keep the columns of computing times; without them a repeated sweep gives the same table.
+    running
+        Whether the caller knows that the sweep goes on; else a warning says how to go on.
 
     Raises
     ------
@@ -74,7 +78,7 @@ def collect(name: str, *, all_versions: bool = False, times: bool = False) -> pd
             warn(f"left out {left_out} of other versions of the code{why}")
         table = table[mine].drop_duplicates(["run_key", REPEAT], keep="last")
         table = table.assign(code_version=code_version())  # which would make the same
-    for n_runs, command in unfinished_sweeps(path):
+    for n_runs, command in () if running else unfinished_sweeps(path):
         here = pluralize(table["run_key"].nunique(), "run")
         words = f"{here} so far: the sweep of {n_runs} is unfinished; to go on: {command}"
         warn(printable(words))

@@ -105,6 +105,30 @@ def test_the_intervals_of_a_decided_sweep_are_drawn_as_they_narrow(tmp_path, chr
     assert lengths[0] / lengths[1] == pytest.approx(np.log(3.2 / 0.8) / np.log(2.4 / 1.2), rel=0.02)
 
 
+def test_a_page_follows_a_sweep_until_it_has_ended(tmp_path, monkeypatch, capsys):
+    (tmp_path / "unfinished-1a.txt").write_text("60 estima run -m seed=0,1\n")
+    monkeypatch.setattr(of_sweep, "FOLLOW_S", 0.01)
+    seen, page = [], tmp_path / "page.html"
+
+    def read():
+        seen.append(page.read_text() if page.exists() else "")
+        if len(seen) == 1:
+            raise InputError("no row yet")
+        if len(seen) == 4:
+            (tmp_path / "unfinished-1a.txt").unlink()
+        return rows().iloc[: 20 + 5 * min(len(seen), 3)]
+
+    assert of_sweep.follow(read, str(tmp_path), page).endswith("page.html")
+    assert len(seen) == 5
+    assert 'http-equiv="refresh"' in seen[2]
+    assert "The sweep of 60 goes on; this page loads again every 0.01 s." in seen[2]
+    assert 'http-equiv="refresh"' not in page.read_text()
+    assert [line.split(": ")[1] for line in capsys.readouterr().err.splitlines()] == [
+        "30 rows",
+        "35 rows",
+    ]
+
+
 def test_a_page_too_large_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(sweep_page, "MOST_RUNS", 10)
     with pytest.raises(InputError, match=r"54 runs; a page holds 10.*condition"):
