@@ -112,7 +112,7 @@ class Lineages:
         M.
     """
 
-    _PRUNE_EVERY = 16
+    _PRUNE_EVERY = 32
 
     def __init__(self, n_particles: int) -> None:
         self._poses: list[Array] = []
