@@ -184,6 +184,7 @@ def revisits(laps: pd.DataFrame, design: Design) -> Iterator[Claim]:
         claim = judge_ratio(about, f"error of SLAM {words}", arms, design, at_most=REVISITS_GROW)
         if grows.verdict is not Verdict.REPRODUCED:
             claim = _undecided(claim, "odometry's is not clearly above it on this course")
+            claim = replace(claim, facts={**claim.facts, "is_open": grows.facts["is_open"]})
         yield beside(claim, not _printed(name, noise))
 
 

@@ -13,6 +13,7 @@ from estimators.landmarks.fastslam import FastSLAM
 from experiments.gate.conform import walk
 from experiments.judging.claim import Role, Verdict, select, select_all
 from experiments.judging.results import Profile
+from experiments.judging.sequential import designs
 from experiments.papers.gil2008 import claims as judge
 from experiments.papers.gil2008 import recordings, scores, settings, study
 from experiments.runs.experiment import Experiment
@@ -305,6 +306,15 @@ def test_dead_reckoning_fails_gi1():
     assert headlines(short)[2] == "undecided"
     own = select(short, quantity="revisits", method="odometry")
     assert (own.verdict, own.role) == ("not_reproduced", "beside")
+
+
+def test_more_laps_are_driven_while_odometry_does_not_clearly_drift():
+    own, ours = judge.revisits(laps(1.0, odometry_ratio=1.3), designs("gil2008")["GI1"])
+    assert (own.verdict, ours.verdict) == ("undecided", "undecided")
+    assert ours.facts["is_open"]
+    own, ours = judge.revisits(laps(1.0, odometry_ratio=1.0), designs("gil2008")["GI1"])
+    assert (own.verdict, ours.verdict) == ("not_reproduced", "undecided")
+    assert not ours.facts["is_open"]  # it is decided that this course cannot tell
 
 
 def test_gi2_and_gi3_tell_a_trend_from_none():
