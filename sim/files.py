@@ -67,7 +67,7 @@ def check_writable(path: Path) -> None:
         As `write_whole` does.
     """
     part = _part_of(path)
-    with _writing(path):
+    with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         part.touch()
         part.unlink()
@@ -80,15 +80,12 @@ def _part_of(path: Path) -> Path:
 
 
 @contextmanager
-def _writing(path: Path) -> Iterator[None]:
-    """Turn an error of writing into one line."""
+def writing(path: Path, remedy: str = "free some space or choose another folder") -> Iterator[None]:
+    """Turn an error of the file system into one line."""
     try:
         yield
     except OSError as error:
-        raise InputError(
-            f"{path}: cannot write ({error.strerror or error}); free some space or choose another "
-            "folder"
-        ) from error
+        raise InputError(f"{path}: cannot write ({error.strerror or error}); {remedy}") from error
 
 
 @contextmanager
@@ -108,7 +105,7 @@ def write_whole(path: Path, *, durable: bool = True) -> Iterator[Path]:
     """
     part = _part_of(path)
     try:
-        with _writing(path):
+        with writing(path):
             path.parent.mkdir(parents=True, exist_ok=True)
             yield part
             with part.open("rb+") as written:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -239,7 +240,8 @@ def report(
         require(out is None or out.suffix == ".html", f"-o {out}: a page is .html")
         if follow:
             require(not pictures, "--pictures: of a sweep that has ended; leave out --follow")
-            show(of_sweep.follow(lambda: _rows(name, kept, True, running=True), name, out))
+            read = partial(_rows, name, kept, times=True, running=True)
+            show(of_sweep.follow(read, name, out, config_dir))
             return
         rows = _rows(name, kept, times=True)
         show(of_sweep.page_of(rows, name, out, config_dir, pictures=pictures))

@@ -95,17 +95,19 @@ def plot_of(rows: pd.DataFrame, name: str, panels: Panels, out: Path) -> Panels:
     return panels
 
 
-def follow(read: Callable[[], pd.DataFrame], name: str, out: Path | None) -> str:
+def follow(
+    read: Callable[[], pd.DataFrame], name: str, out: Path | None, config_dir: Path | None
+) -> str:
     """Write a sweep's page again and again until the sweep has ended; return its path."""
     n_rows = -1
     while unfinished_sweeps(folder_of(name)):
         with suppress(InputError):  # no row yet, or none with a result
             if len(rows := read()) != n_rows:
                 n_rows = len(rows)
-                page = page_of(rows, name, out, None, pictures=False, refresh_s=FOLLOW_S)
+                page = page_of(rows, name, out, config_dir, pictures=False, refresh_s=FOLLOW_S)
                 warn(f"{page}: {pluralize(n_rows, 'row')}")
         time.sleep(FOLLOW_S)
-    return page_of(read(), name, out, None, pictures=False)
+    return page_of(read(), name, out, config_dir, pictures=False)
 
 
 def page_of(

@@ -14,7 +14,7 @@ import os
 import re
 import zlib
 from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -38,7 +38,7 @@ from experiments.runs.row import (
 )
 from experiments.runs.version import code_version
 from sim.errors import InputError, require
-from sim.files import require_file, write_whole
+from sim.files import require_file, write_whole, writing
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -52,6 +52,7 @@ ENDED = (_WHOLE, _CHANGES, _FAILED)  # kinds of lines of runs that have ended
 KIND_AT = 9  # place of the kind in a line, after the checksum
 _STATUS = ["run_key", "status", "status_code", "status_detail", DEPENDENCIES, "code_version"]
 _KEY, _DIGEST = re.compile("[0-9a-f]{16}"), re.compile("[0-9a-f]{12}")
+_REMEDY = "free some space, or choose another folder of results with ESTIMA_RESULTS"
 _SMALL_BYTES, _MOST_SMALL = 2**22, 100  # small files are merged when there are more of them
 
 
@@ -67,7 +68,7 @@ class Journal:
         self.path = path
         self._basis: Row = {}
         self._basis_crc = 0
-        with _writing(path):
+        with writing(path, _REMEDY):
             path.parent.mkdir(parents=True, exist_ok=True)
             self._file = path.open("ab", buffering=0)
             if self._file.tell():  # a job tried again: its last line may be half written
@@ -98,7 +99,7 @@ class Journal:
         text = bytes([kind]) + json.dumps(payload).encode()
         crc = zlib.crc32(text, basis_crc)
         line = b"%08x %s\n" % (crc, text)
-        with _writing(self.path):
+        with writing(self.path, _REMEDY):
             size = self._file.seek(0, os.SEEK_END)
             if self._file.write(line) != len(line):  # the disk is full
                 self._file.truncate(size)
@@ -399,15 +400,3 @@ def _as_numbers(keys: pa.ChunkedArray) -> NDArray[np.uint64]:
 def _same(a: Any, b: Any) -> bool:
     """Whether two values are the same, of the same type; 0.0 and -0.0 are not."""
     return type(a) is type(b) and repr(a) == repr(b)
-
-
-@contextmanager
-def _writing(path: Path) -> Iterator[None]:
-    """Turn an error of the file system into one line."""
-    try:
-        yield
-    except OSError as error:
-        raise InputError(
-            f"{path}: cannot write ({error.strerror or error}); free some space, or choose another "
-            "folder of results with ESTIMA_RESULTS"
-        ) from error

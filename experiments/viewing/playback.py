@@ -31,7 +31,8 @@ class RobotTrack:
     @property
     def estimates(self) -> list[Estimate]:
         """All of them, its own first."""
-        return [each for each in (self.estimate, *dict(self.others).values()) if each is not None]
+        own = [] if self.estimate is None else [self.estimate]
+        return [*own, *(other for _, other in self.others)]
 
     def belief_row(self, stamp: float) -> int:
         """Row of the last belief up to a time; -1 before the first, or without an estimate."""

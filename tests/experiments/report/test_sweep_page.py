@@ -118,7 +118,7 @@ def test_a_page_follows_a_sweep_until_it_has_ended(tmp_path, monkeypatch, capsys
             (tmp_path / "unfinished-1a.txt").unlink()
         return rows().iloc[: 20 + 5 * min(len(seen), 3)]
 
-    assert of_sweep.follow(read, str(tmp_path), page).endswith("page.html")
+    assert of_sweep.follow(read, str(tmp_path), page, None).endswith("page.html")
     assert len(seen) == 5
     assert 'http-equiv="refresh"' in seen[2]
     assert "The sweep of 60 goes on; this page loads again every 0.01 s." in seen[2]

@@ -247,6 +247,13 @@ def test_several_estimates_lie_over_one_another(recording, tmp_path):
         assert tab.complaints() == []
 
 
+def test_estimates_of_one_name_are_all_kept(recording):
+    off = believed(recording, recording.truth_at(recording.frame_stamps))
+    others = (("estimate.csv", off), ("estimate.csv", off))
+    assert len(RobotTrack(recording, off, others).estimates) == 3
+    assert len(RobotTrack(recording, None, others).estimates) == 2
+
+
 def without_others(shown):
     own = dataclasses.replace(shown.robots[0], others=())
     return dataclasses.replace(shown, robots=(own,))
