@@ -110,17 +110,20 @@ class Anchor:
     @property
     def words(self) -> str:
         """The settings in words."""
-        return ", ".join(f"{name} = {_short(value)}" for name, value in self.settings.items())
+        return ", ".join(f"{name} = {as_words(value)}" for name, value in self.settings.items())
 
     def of(self, name: str) -> str:
         """A setting's value in words; of several data sets, each one's."""
         own = {
             key.removeprefix(name): v for key, v in self.settings.items() if key.startswith(name)
         }
-        return " and ".join(f"{_short(value)}{place}" for place, value in own.items())
+        return " and ".join(f"{as_words(value)}{place}" for place, value in own.items())
 
 
-def _short(value: Any) -> str:
+def as_words(value: Any) -> str:
+    """A setting's value for a sentence."""
+    if isinstance(value, bool):
+        return "yes" if value else "no"
     return f"{value:.3g}" if isinstance(value, float) else str(value)
 
 

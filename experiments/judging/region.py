@@ -18,6 +18,7 @@ from experiments.judging.free_settings import (
     Anchor,
     Setting,
     are_choices,
+    as_words,
     sample,
     snap,
     units_of,
@@ -32,7 +33,6 @@ NOWHERE, EVERYWHERE, NONE_ALONE = (
     "everywhere in the region",
     "no single setting",
 )
-_CHOICES: Mapping[Any, str] = {True: "yes", False: "no"}
 _N_SHARE, _N_OTHERS, _N_LEVELS, _N_LINE = 1024, 64, 16, 201
 
 
@@ -115,6 +115,10 @@ class Region:
             said += ", and no single setting decides"
         else:
             said += f"; {called} decides: it {self.boundary}"
+        said += "".join(
+            f". The interval spans {100 * limit:.0f} %, so the region leaves it open"
+            for limit in limits_spanned(self.share)
+        )
         if self.anchor is None:
             return f"{said}."
         printed = "where the printed level comes out"
@@ -223,12 +227,8 @@ def boundary_in_words(fitted: Fitted, i: int) -> str:
         line = np.full((len(setting.choices), len(fitted.settings)), 0.5)
         line[:, i] = setting.units(setting.choices)
         good = fitted.margins(snap(fitted.settings, line))[0] > 0.0
-        named = [
-            _CHOICES.get(c, str(c))
-            for c, is_good in zip(setting.choices, good, strict=True)
-            if is_good
-        ]
-        return f"holds at {', '.join(named)}" if named else NOWHERE
+        named = [as_words(c) for c, holds in zip(setting.choices, good, strict=True) if holds]
+        return f"holds where it is {' or '.join(named)}" if named else NOWHERE
     if stretch is None:
         return NOWHERE
     low, high = stretch
@@ -255,6 +255,11 @@ def describe(fitted: Fitted, anchor: Anchor | None) -> Region:
     return Region(anchor, found, own.name, boundary_in_words(fitted, first), own.called)
 
 
+def limits_spanned(share: Interval) -> list[float]:
+    """Those of the two limits of a region's share that lie in its interval."""
+    return [limit for limit in (LEAST, MOST) if share.low <= limit <= share.high]
+
+
 def rule(at_anchor: Verdict, found: Interval) -> Verdict:
     """The verdict on a claim by its headlines at the anchor and the region's share.
 
@@ -265,7 +270,7 @@ def rule(at_anchor: Verdict, found: Interval) -> Verdict:
     found
         Share of the region in which the claim holds.
     """
-    spans = any(found.low <= limit <= found.high for limit in (LEAST, MOST))
+    spans = limits_spanned(found)
     if at_anchor is Verdict.UNDECIDED or spans or not math.isfinite(found.value):
         return Verdict.UNDECIDED
     if found.low > MOST and at_anchor is not Verdict.NOT_REPRODUCED:

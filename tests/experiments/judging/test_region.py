@@ -13,6 +13,7 @@ from experiments.judging.free_settings import (
     Anchor,
     Scale,
     Setting,
+    as_words,
     middle,
     sample,
     units_of,
@@ -192,7 +193,8 @@ def test_the_boundary_is_said_in_the_settings_own_numbers():
     assert "robot.kr decides: it holds below 0.0001 [" in said
     assert said.endswith("as no level is printed (robot.kr: 0.0001), it does not hold.")
     chosen = planted(lambda u: u[:, 1] - 0.5 - NEED, 8, 0.1, settings=settings)[0]
-    assert boundary_in_words(chosen, 1) == "holds at measured"
+    assert boundary_in_words(chosen, 1) == "holds where it is measured"
+    assert as_words(True) == "yes"
     above = planted(lambda u: stepped(1.0 - u[:, ::-1]), 9, 0.1, settings=settings)[0]
     assert boundary_in_words(above, 2).startswith("holds above 1")
     for effect, words in ((nothing, NOWHERE), (lambda u: -0.5 + 0.0 * u[:, 0], EVERYWHERE)):
