@@ -10,6 +10,7 @@ import dataclasses
 import json
 import math
 import os
+import re
 import shutil
 import statistics
 import subprocess
@@ -35,6 +36,7 @@ _SLICE_S = 0.003  # of processor time, after which a process lets the other one 
 _TURNS = range(6, 41)  # of a round, as many as the noise asks for;
 _SURE = 0.02  # until the medians have this standard error, as a share,
 _ROUND_S = 20.0  # or this time is up
+_EXCEPTION = re.compile(r"[\w.]+(Error|Exception)\b")  # begins the last line of a traceback
 _LOCK = "requirements.lock"  # of the environment
 _WALL = ("compile", "external", "sweep", "sweep_scale")  # their children do the work
 _BENCH = """
@@ -43,16 +45,22 @@ def answer(name):
     return json.loads(run_bench(name, as_json=True))["results"]
 """
 # The clocks give processor time. Where they are read, a process that has run for a while answers
-# null, and waits until it is asked again; what that takes does not count. What else the code prints
-# goes to stderr.
+# null, and waits until it is asked again; what that takes does not count. One that holds a lock
+# goes on, as the other may need it. What else the code prints goes to stderr.
 _SERVED = """
-import json, sys, threading, time
+import fcntl, json, sys, threading, time
 out, sys.stdout = sys.stdout, sys.stderr
 own, lost_s, last_s, main = time.process_time, 0.0, 0.0, threading.get_ident()
+lock, locked = fcntl.flock, []
+def flock(file, how):
+    lock(file, how)
+    locked[:] = [one for one in [*locked, file] if not getattr(one, "closed", True)]
+fcntl.flock = flock
 def processor_s():
     global lost_s, last_s
     now_s, before_s = own(), lost_s
-    if now_s - last_s > {slice_s} and threading.get_ident() == main:
+    goes_on = threading.get_ident() != main or not all(file.closed for file in locked)
+    if now_s - last_s > {slice_s} and not goes_on:
         print("null", file=out, flush=True)
         sys.stdin.readline()
         last_s = own()
@@ -93,6 +101,24 @@ def git(*words: str, folder: Path | None = None) -> str:
     return ran.stdout.strip()
 
 
+def commit_of(revision: str, folder: Path | None = None) -> str:
+    """The whole name of a revision's commit.
+
+    Raises
+    ------
+    InputError
+        If there is none.
+    """
+    try:
+        require(not revision.startswith("-"), "an option of git's")
+        return git("rev-parse", f"{revision}^{{commit}}", folder=folder)
+    except InputError:
+        raise InputError(
+            f"{revision}: no such revision; `git log` lists them, and `git fetch` gets those that "
+            "this clone lacks"
+        ) from None
+
+
 def clone_of(file: Path) -> Path | None:
     """The clone that a file lies in; None for that of the running code."""
     if file.resolve().is_relative_to(paths.CONF.resolve()):
@@ -111,8 +137,7 @@ def checkout(revision: str, folder: Path | None = None) -> Checkout:
     folder
         The clone; by default that of the running code.
     """
-    require(not revision.startswith("-"), f"{revision} is not a revision")
-    commit = git("rev-parse", f"{revision}^{{commit}}", folder=folder)
+    commit = commit_of(revision, folder)
     place = paths.results() / "cache" / "checkouts" / commit[:12]
     if not (place / ".git").exists():
         place.parent.mkdir(parents=True, exist_ok=True)
@@ -151,7 +176,9 @@ def _command(folder: Path, script: str, *arguments: str) -> dict[str, Any]:
 
 
 def _why(stderr: str, code: int | None) -> str:
-    return (stderr.strip().splitlines() or [f"code {code}"])[-1]
+    """The last line that names an exception, whose message may go on below; else the last one."""
+    lines = stderr.strip().splitlines() or [f"code {code}"]
+    return ([line for line in lines if _EXCEPTION.match(line)] or lines)[-1]
 
 
 def run_in(folder: Path, script: str, *arguments: str) -> Any:

@@ -16,7 +16,7 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
-from experiments.bench.against import checkout, clone_of, git
+from experiments.bench.against import checkout, clone_of, commit_of, git
 from experiments.gate.compare import Change, Finding, by_repeat, compare, failed_runs
 from experiments.gate.report import sentence
 from experiments.gate.revision import rows_in
@@ -135,7 +135,7 @@ def _of(estimator: str, rows: pd.DataFrame) -> pd.DataFrame:
 
 def history(good: str, bad: str, folder: Path | None = None) -> list[str]:
     """Commits from a good one to a bad one, both included, along the first parents."""
-    first, last = (git("rev-parse", f"{name}^{{commit}}", folder=folder) for name in (good, bad))
+    first, last = (commit_of(name, folder) for name in (good, bad))
     commits = [last]
     while commits[0] != first:
         parents = git("cat-file", "-p", commits[0], folder=folder).partition("\n\n")[0]

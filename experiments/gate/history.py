@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from experiments.bench.against import checkout, clone_of, git
+from experiments.bench.against import checkout, clone_of, commit_of, git
 from experiments.evaluation.statistics import log_ratio_interval
 from experiments.gate.baseline import baseline_paths
 from experiments.gate.compare import WHICH, Change, Finding, by_repeat, check_recordings, compare
@@ -87,8 +87,9 @@ def append(
     kept = [read_history(path)] if path.exists() else []
     known = {commit for rows in kept for commit in rows["commit"]}
     failed = []
+    old = checkout(speed, clone) if speed is not None else None
     for revision in revisions:
-        commit = git("rev-parse", f"{revision}^{{commit}}", folder=clone)
+        commit = commit_of(revision, clone)
         if commit in known:
             show(f"{commit[:12]} is there")
             continue
@@ -102,8 +103,7 @@ def append(
             continue
         rows = rows.assign(commit=commit, **_about(commit, clone))
         rows[["against", "step_ratio", "step_low", "step_high"]] = "", np.nan, np.nan, np.nan
-        if speed is not None:
-            old = checkout(speed, clone)
+        if old is not None:
             runs = whole.made(elsewhere=False)
             for name, ratio in step_ratios(runs, folder, old.folder).items():
                 of_one = rows["estimator"] == name

@@ -112,6 +112,28 @@ def answer(item):
         assert alone("x") >= 0.05
 
 
+def test_who_holds_a_lock_keeps_the_turn(repository, tmp_path):
+    script = f"""
+import fcntl
+def answer(item):
+    begun = time.process_time()
+    with open({str(tmp_path / "lock")!r}, "w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        while time.perf_counter() - begun < 0.05:
+            pass
+    while time.perf_counter() - begun < 0.1:
+        pass
+    return "done"
+"""
+    with serving(script, [], repository) as one, serving(script, [], repository) as other:
+        for _ in range(2):  # before the lock, and with it: neither waits for the other's
+            assert [one("x"), other("x")] == [None, None]
+        for ask in (one, other):
+            while (last := ask("x")) is None:
+                pass
+            assert last == "done"
+
+
 def test_a_long_suite_takes_one_turn_a_round(monkeypatch):
     monkeypatch.setattr(against, "_ROUND_S", 0.0)
     assert counted(1.0)[0] == against.ROUNDS
@@ -139,6 +161,14 @@ def test_a_revision_is_checked_out_once(repository, capsys):
             checkout(revision, repository)
     with pytest.raises(InputError, match="No module named 'gone'"):
         run_in(repository, "import gone")
+    with pytest.raises(InputError, match="ValueError: no such option"):
+        run_in(repository, "raise ValueError('no such option\\nit knows\\nthese')")
+
+
+@pytest.mark.parametrize("name", ["nowhere", "-x", "", "HEAD~999999"])
+def test_a_revision_that_is_not_there_is_named(repository, name):
+    with pytest.raises(InputError, match=f"^{name}: no such revision; `git log` lists"):
+        checkout(name, repository)
 
 
 def test_a_process_answers_in_turn_until_it_fails(repository):
