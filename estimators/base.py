@@ -157,7 +157,7 @@ Answer = tuple[Estimate, Estimate | None]  # of one robot: online and revised
 
 
 class BeliefError(Exception):
-    """A step returned something else than a belief; the run's Status says what."""
+    """A step or `finish` returned something else than it must; the run's Status says what."""
 
 
 class Estimator(Protocol):
@@ -278,13 +278,26 @@ def run_and_finish(
 def finish(
     estimator: Any, n_robots: int, on_step: Callable[[], None] | None = None
 ) -> Sequence[Estimate | None]:
-    """Estimate of each robot that `finish` or `finish_team` gives, or None."""
+    """Estimate of each robot that `finish` or `finish_team` gives, or None.
+
+    Raises
+    ------
+    BeliefError
+        If it gives something else.
+    """
     if n_robots == 1 and hasattr(estimator, "finish"):
         told = "on_step" in inspect.signature(estimator.finish).parameters
-        return [estimator.finish(on_step) if told else estimator.finish()]
-    paths: Sequence[Estimate | None] = (
-        estimator.finish_team() if hasattr(estimator, "finish_team") else [None] * n_robots
-    )
+        paths = [estimator.finish(on_step) if told else estimator.finish()]
+    elif hasattr(estimator, "finish_team"):
+        paths = estimator.finish_team()
+    else:
+        paths = [None] * n_robots
+    for path in paths:
+        if not isinstance(path, Estimate | None):
+            who = type(estimator).__name__
+            raise BeliefError(
+                f"{who}.finish must return an Estimate or None, got {type(path).__name__}"
+            )
     return paths
 
 

@@ -45,6 +45,8 @@ NonNegative = Annotated[float, Field(ge=0.0)]
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
 Probability = Annotated[float, Field(gt=0.0, lt=1.0)]
 Count = Annotated[int, Field(ge=1)]
+Offset = Annotated[float, Field(ge=-100.0, le=100.0)]  # m, of what a robot carries
+Turn = Annotated[float, Field(ge=-2.0 * math.pi, le=2.0 * math.pi)]
 Acute = Annotated[float, Field(gt=0.0, lt=math.pi)]
 # Of a YAML's lists; a text in an Annotated says what the type accepts
 Point = Annotated[tuple[float, float], Strict(False), "a point [x, y]"]
@@ -258,14 +260,13 @@ def accepted(kind: Any) -> str:
         said = " and ".join(f"{_SIGNS[sign]} {_shown(limit)}" for sign, limit in bounds)
         if [sign for sign, _ in bounds] == ["ge", "le"]:
             said = f"from {_shown(bounds[0][1])} to {_shown(bounds[1][1])}"
-        return (
-            f"{'a whole number' if whole else 'a number'}, {said}" if said else accepted(parts[0])
-        )
+        comma = "," if said.startswith("at ") else ""  # above 0, from 1 to 3 follow without
+        return f"{accepted(parts[0])}{comma} {said}".rstrip()
     if get_origin(kind) is Literal:
         return f"one of {', '.join(map(str, parts))}"
     if type(None) in parts:
         others = [accepted(part) for part in parts if part is not type(None)]
-        return f"{' or '.join(filter(None, others)) or 'a value'} or null"
+        return f"{' or '.join(filter(None, others)) or 'a value'}, or null"
     plain = {float: "a number", int: "a whole number", bool: "true or false", str: "a text"}
     return plain.get(kind, "")
 

@@ -21,7 +21,7 @@ import numpy as np
 
 from sim import se2
 from sim.arrays import Array
-from sim.errors import require
+from sim.errors import naming, require
 from sim.files import write_text
 from sim.formats import assemble
 from sim.formats.text import Rows, Words, read_words
@@ -123,6 +123,8 @@ def read_carmen(source: Path | Words) -> CarmenLog:
     rows = assemble.in_order(stamps, "scans", notes)
     x, y, yaw = _mount(poses, laser_poses)
     middle = float(start) + max(float(step) * (n_beams - 1), 1e-9) / 2.0
+    with naming(words.where):
+        mount = Mount(x_m=x, y_m=y, yaw_rad=float(se2.wrap(yaw + middle)))
     return CarmenLog(
         odometry_stamps=odometry[:, 6].copy(),
         odometry_poses=odometry[:, :3].copy(),
@@ -134,7 +136,7 @@ def read_carmen(source: Path | Words) -> CarmenLog:
             n_beams,
             float(step),
             float(max_range),
-            Mount(x_m=x, y_m=y, yaw_rad=float(se2.wrap(yaw + middle))),
+            mount,
         ),
         edges=_edges(words, lines[rows]),
         is_graph=bool(len(words.lines_of("VERTEX2"))),

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from sim.arrays import Array, Values
-from sim.errors import InputError, require
+from sim.errors import InputError, naming, require
 from sim.formats import assemble
 from sim.formats.rosbag import (
     CLOUD,
@@ -258,14 +258,15 @@ def _laser(
     fov = max(step * (n_beams - 1), 1e-9)
     yaw = math.atan2(T_base_laser[1, 0], T_base_laser[0, 0]) + start + fov / 2.0
     x, y, z = (float(v) for v in T_base_laser[:3, 3])
-    laser = Laser(
-        rate_hz=assemble.rate_hz(stamps[rows]),
-        n_beams=n_beams,
-        fov_rad=min(fov, 2.0 * math.pi),
-        min_range_m=max(lowest, 0.0),
-        max_range_m=min(highest, written),
-        mount=Mount(x_m=x, y_m=y, z_m=z, yaw_rad=math.remainder(yaw, 2.0 * math.pi)),
-    )
+    with naming(path):
+        laser = Laser(
+            rate_hz=assemble.rate_hz(stamps[rows]),
+            n_beams=n_beams,
+            fov_rad=min(fov, 2.0 * math.pi),
+            min_range_m=max(lowest, 0.0),
+            max_range_m=min(highest, written),
+            mount=Mount(x_m=x, y_m=y, z_m=z, yaw_rad=math.remainder(yaw, 2.0 * math.pi)),
+        )
     return laser, Log.of(laser, stamps[rows], ranges_m=ranges)
 
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from sim import se2
 from sim.arrays import Array
-from sim.errors import require
+from sim.errors import naming, require
 from sim.formats import assemble
 from sim.formats.text import Words, read_words
 from sim.recording import Recording
@@ -85,7 +85,8 @@ def read_wean(
     of_laser = head[:, 3:] / np.array([100.0, 100.0, 1.0])
     x, y, yaw = np.median(se2.between(poses[len(odometry) :], of_laser), axis=0).tolist()
     step = math.pi / _N_BEAMS
-    mount = Mount(x_m=x, y_m=y, yaw_rad=yaw - step / 2.0)
+    with naming(words.where):
+        mount = Mount(x_m=x, y_m=y, yaw_rad=yaw - step / 2.0)
     return assemble.scan_recording(
         wheels,
         stamps[order],

@@ -24,7 +24,7 @@ import numpy as np
 from sim import se2
 from sim.arrays import Array, Bools, Ints, Values
 from sim.errors import InputError, blaming, require
-from sim.options import build, find, options
+from sim.options import Offset, Turn, build, find, options
 from sim.worlds.world import World
 
 S = TypeVar("S")
@@ -285,10 +285,10 @@ Sensors = Mapping[str, Sensor]
 class Mount:
     """Pose of a sensor in base_link: x forward, y left, z up (m), yaw (rad)."""
 
-    x_m: float = 0.0
-    y_m: float = 0.0
-    z_m: float = 0.2
-    yaw_rad: float = 0.0
+    x_m: Offset = 0.0
+    y_m: Offset = 0.0
+    z_m: Offset = 0.2
+    yaw_rad: Turn = 0.0
 
     @property
     def pose(self) -> Array:

@@ -72,6 +72,16 @@ def test_a_right_one_passes(experiment):
     assert row["status"] == "ok"
 
 
+@pytest.mark.parametrize("wrong", [1, [], np.zeros((9, 3))], ids=["number", "list", "array"])
+def test_what_finish_gives_is_an_estimate_or_none(wrong, experiment):
+    estimator = Errs(lambda mean, cov: (mean, cov))
+    estimator.finish = lambda: wrong
+    (row,) = evaluate(experiment.with_estimator_object(estimator))
+    assert row["status"] == "failed"
+    said = f"Errs.finish must return an Estimate or None, got {type(wrong).__name__}"
+    assert said in row["status_detail"]
+
+
 def test_the_first_is_an_error_of_the_input():
     recording = fakes.circle()
     with pytest.raises(InputError, match=r"got shapes \(\) and \(\)"):

@@ -292,7 +292,7 @@ def test_a_failing_program_is_a_status_of_its_row(tmp_path):
         ({"command": "no_such_program_here --fast"}, "no program no_such_program_here"),
         ({"command": "build/peers/mrpt icp"}, "`make peers` compiles it"),
         ({"command": "python3 'open"}, "No closing quotation"),
-        ({"command": PYTHON, "step_s": 0}, "step_s must be a number, above 0"),
+        ({"command": PYTHON, "step_s": 0}, "step_s must be a number above 0"),
     ],
 )
 def test_wrong_settings_are_named(settings, message, tmp_path, monkeypatch):

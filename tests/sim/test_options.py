@@ -53,9 +53,9 @@ def test_a_method_keeps_its_options_frozen_and_has_a_state():
         ({"kr": "x"}, "estimator.kr must be zero or a positive number, got 'x'"),
         ({"kr": float("nan")}, "estimator.kr must be zero or a positive number, got nan"),
         ({"how": "c"}, "estimator.how must be one of a, b, got 'c'"),
-        ({"share": 2}, r"estimator.share must be a number in \[0, 1\] or null, got 2"),
+        ({"share": 2}, r"estimator.share must be a number in \[0, 1\], or null, got 2"),
         ({"on": 1}, "estimator.on must be true or false, got 1"),
-        ({"size": 11}, "estimator.size must be a whole number, from 1 to 10, got 11"),
+        ({"size": 11}, "estimator.size must be a whole number from 1 to 10, got 11"),
         (
             {"nn": 3},
             "unknown key estimator.nn; known: estimator.n, estimator.kr, estimator.q, .*",

@@ -242,7 +242,7 @@ def test_wrong_input_is_named():
     for options, word in (
         ({"min_particles": 100, "max_particles": 50}, "min_particles"),
         ({"min_ess": 0.5, "ess_share": 0.5}, "ess_share"),
-        ({"max_particles": 10**12}, "max_particles must be a whole number, from 1 to 10000000"),
+        ({"max_particles": 10**12}, "max_particles must be a whole number from 1 to 10000000"),
         ({"max_particles": 10**6, "tries": 10**12}, "tries"),
     ):
         with pytest.raises(InputError, match=word):

@@ -112,6 +112,16 @@ def test_wrong_lines_are_named(line, reason):
         carmen(data)
 
 
+def test_a_laser_far_from_its_robot_is_refused_with_the_files_name():
+    scans = [line.split() for line in flaser_log().splitlines() if line.startswith(b"FLASER")]
+    moved = flaser_log()
+    for words in scans:
+        there = [*words[:6], b"%g" % (float(words[6]) + 2e3), *words[7:]]
+        moved = moved.replace(b" ".join(words), b" ".join(there))
+    with pytest.raises(InputError, match=r"^log: sensors\.mount\.[xy]_m must be .* 100, got"):
+        carmen(moved)
+
+
 def test_a_log_without_scans():
     with pytest.raises(InputError, match="FLASER or ROBOTLASER1"):
         carmen(b"ODOM 0 0 0 0 0 0 1 host 1\n")

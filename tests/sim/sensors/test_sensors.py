@@ -100,7 +100,7 @@ LASER, STEREO = "sim.sensors.laser.Laser", "sim.sensors.stereo.StereoCamera"
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"laser": {"_target_": LASER, "n_beams": 0}}, "n_beams must be a whole number, from 1"),
+        ({"laser": {"_target_": LASER, "n_beams": 0}}, "n_beams must be a whole number from 1"),
         ({"front": {"_target_": LASER, "n_beans": 7}}, r"unknown key sensors\.front\.n_beans"),
         ({"laser": {"_target_": LASER, "n_beams": "many"}}, "whole number"),
         ({"laser": {"_target_": LASER, "sigma_range_m": float("nan")}}, "sigma_range_m"),

@@ -8,6 +8,7 @@ import pytest
 from sim.errors import InputError
 from sim.sensors import (
     Field,
+    Mount,
     sensors_from_config,
 )
 from tests.sim.sensors.test_own_sensor import drive
@@ -92,3 +93,10 @@ def test_a_shape_is_a_tuple_of_sizes(shape):
 def test_names_of_what_a_recording_holds_besides_are_taken(name):
     with pytest.raises(InputError, match="none of wheels, commands, truth"):
         sensors_from_config({name: {"_target_": "sim.sensors.encoder.Encoder"}})
+
+
+@pytest.mark.parametrize("key", ["x_m", "y_m", "z_m", "yaw_rad"])
+@pytest.mark.parametrize("value", [1e300, -101.0, float("nan")])
+def test_a_mount_is_on_the_robot(key, value):
+    with pytest.raises(InputError, match=rf"sensors\.mount\.{key} must be a number from -"):
+        Mount(**{key: value})
