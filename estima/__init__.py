@@ -97,7 +97,7 @@ class Run:
         error_m, nees = numbers.get(f"{prefix}ate_rmse_m"), numbers.get(f"{prefix}nees_mean")
         step_us = numbers.get("step_time_us")
         facts = [
-            str(row["status"]) if row["status"] != "ok" else "",
+            f"{row['status']}, {row['status_detail']}" if row["status"] != "ok" else "",
             "" if error_m is None else f"position RMSE {error_m * 1000.0:.3g} mm",
             "" if nees is None else f"NEES {nees:.3g}",
             "" if step_us is None else f"{step_us / 1000.0:.3g} ms a step",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated
 
@@ -116,7 +117,8 @@ def main() -> None:
         try:
             app(_own_first(sys.argv[1:]))
         finally:
-            sys.stdout.flush()
+            with suppress(ValueError):  # an estimator has closed it
+                sys.stdout.flush()
     except (Exception, KeyboardInterrupt) as error:
         exit_with(error)
     except SystemExit as ended:

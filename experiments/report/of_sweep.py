@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -22,6 +21,7 @@ from experiments.sweeps.again import draw_recorded_run, short_key
 from experiments.sweeps.collect import folder_of, suggest_axes, unfinished_sweeps
 from experiments.sweeps.summary import summary
 from experiments.sweeps.winner import find_winner
+from experiments.sweeps.work import may_run
 from experiments.viewing.play import Showing
 from experiments.viewing.style import save_figure
 from sim.errors import InputError, require
@@ -98,15 +98,27 @@ def plot_of(rows: pd.DataFrame, name: str, panels: Panels, out: Path) -> Panels:
 def follow(
     read: Callable[[], pd.DataFrame], name: str, out: Path | None, config_dir: Path | None
 ) -> str:
-    """Write a sweep's page again and again until the sweep has ended; return its path."""
-    n_rows = -1
-    while unfinished_sweeps(folder_of(name)):
-        with suppress(InputError):  # no row yet, or none with a result
+    """Write a sweep's page again and again until the sweep has ended; return its path.
+
+    One that was stopped ends it too. What keeps a page from being written is said, each once.
+    """
+    n_rows, folder = -1, folder_of(name)
+    said: set[str] = set()
+    n_idle = 0  # looks at it without a process that plans; between its parts there is none
+    while n_idle < 2 and (unfinished := unfinished_sweeps(folder)):
+        try:
             if len(rows := read()) != n_rows:
                 n_rows = len(rows)
                 page = page_of(rows, name, out, config_dir, pictures=False, refresh_s=FOLLOW_S)
                 warn(f"{page}: {pluralize(n_rows, 'row')}")
+        except InputError as error:  # no row yet, or none with a result
+            if str(error) not in said:
+                warn(f"waiting: {error}")
+            said.add(str(error))
+        n_idle = 0 if any(map(may_run, folder.glob("plan-*.json"))) else n_idle + 1
         time.sleep(FOLLOW_S)
+    if n_idle == 2:
+        warn("\n".join(["the sweep was stopped; go on with", *(line for _, line in unfinished)]))
     return page_of(read(), name, out, config_dir, pictures=False)
 
 

@@ -1,5 +1,6 @@
 """Terminal output: progress, and the one line that ends a failed command."""
 
+import difflib
 import errno
 import math
 import os
@@ -36,8 +37,8 @@ def progress(
 
     It draws a bar on a terminal, and prints a line now and then elsewhere; of what is counted, only
     when more is done. Nothing is shown for the first two seconds, and no time left for the first
-    ten, nor before a twentieth is done, or ten of what is counted. With `restart` the rate, and so
-    the time left, counts from there on.
+    ten, nor before a twentieth is done, or ten of a unit that is counted. With `restart` the rate,
+    and so the time left, counts from there on.
 
     Parameters
     ----------
@@ -61,7 +62,8 @@ def progress(
         rate = (done - start) / max(now - start_s, 1e-9)
         state = _state(done, total, unit, now - begun, rate)
         line = f"{label}: {state}" if label else state
-        rated = done - start >= min(_RATED_SHARE * (total or math.inf), _RATED_UNITS)
+        enough = _RATED_UNITS if unit else math.inf  # a first Frame may have to compile
+        rated = done - start >= min(_RATED_SHARE * (total or math.inf), enough)
         if total and done < total and rated and now - start_s >= _RATED_S:
             line += f", {_time((total - done) / rate)} left"
         if failed:
@@ -132,7 +134,7 @@ def exit_with(error: BaseException) -> NoReturn:
         if isinstance(link, KeyboardInterrupt):
             for again in (signal.SIGINT, signal.SIGTERM):  # what is said is said whole
                 signal.signal(again, signal.SIG_IGN)
-            _say(str(link) or "interrupted; what was finished is kept", 130)
+            _say(str(link) or "interrupted; what a sweep, study or check has finished is kept", 130)
         if isinstance(link, _configuration_errors()):
             if refusal := _refusal(link):
                 _say(refusal, 2)
@@ -172,7 +174,9 @@ def _refusal(error: BaseException) -> str | None:
         return None
     group, _, name = missing.rpartition("/")
     every = sorted({*options, *option_names(group)})
-    return f"no {group} named {name}; there are: {', '.join(every)}"
+    near = difflib.get_close_matches(name, every, n=1)
+    meant = f"did you mean {near[0]}? " if near else ""
+    return f"no {group} named {name}; {meant}there are: {', '.join(every)}"
 
 
 def _configuration_errors() -> tuple[type[Exception], ...]:
@@ -206,7 +210,20 @@ def _say(message: str, code: int) -> NoReturn:
 
 
 def _write(text: str, stream: TextIO) -> None:
-    """Print text with ? for what the stream's encoding lacks."""
+    """Print text with ? for what the stream's encoding lacks.
+
+    Raises
+    ------
+    InputError
+        If an estimator has closed the output.
+    """
+    if stream.closed:
+        if stream is sys.stderr:
+            return
+        raise InputError(
+            "the standard output is closed, by code of an estimator's or a sensor's: what was to "
+            "be printed is lost, files are written"
+        )
     encoding = stream.encoding or "utf-8"
     with suppress(OSError) if stream is sys.stderr else nullcontext():  # nowhere else to say it
         print(text.encode(encoding, "replace").decode(encoding), file=stream, flush=True)

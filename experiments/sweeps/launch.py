@@ -19,6 +19,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +39,7 @@ from experiments.sweeps.work import (
     compiling_file,
     end_with,
     failure_row,
-    is_alive,
+    may_run,
     run_share,
     share_path,
 )
@@ -220,6 +221,7 @@ def _launch(plan: Plan, runs: Numbers, jobs: Jobs, launching: Sequence[str]) -> 
     """
     from joblib.externals.loky.process_executor import TerminatedWorkerError
 
+    tie_workers()
     numbers = [jobs.add(*share) for share in plan.split(runs, jobs.count)]
     arguments, os.environ["HYDRA_FULL_ERROR"] = sys.argv, "1"  # its errors come to the caller
     sys.argv = [
@@ -249,6 +251,15 @@ def _launch(plan: Plan, runs: Numbers, jobs: Jobs, launching: Sequence[str]) -> 
     return None
 
 
+def tie_workers() -> None:
+    """Let joblib's workers end with this process, also those that never get a job."""
+    from joblib._parallel_backends import LokyBackend
+    from joblib.parallel import BACKENDS
+
+    me = platform.node(), os.getpid()
+    BACKENDS["loky"] = partial(LokyBackend, initializer=end_with, initargs=me)
+
+
 def _for_cluster(launching: Sequence[str]) -> list[str]:
     """Overrides that make Ray's launcher omit a setting that a running cluster rejects."""
     memory = "hydra.launcher.ray.init.object_store_memory"
@@ -273,11 +284,7 @@ def prepare(folder: Path) -> None:
     """
     for plan in folder.glob("plan-*.json"):  # of this machine, with what they were writing
         require_file(plan)
-        try:
-            node, planner = json.loads(plan.read_text())["planner"]
-            if node != platform.node() or is_alive(planner):
-                continue
-        except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
+        if may_run(plan):
             continue
         _remove(plan)
         for part in folder.glob(f".rows-{plan.stem.removeprefix('plan-')}*.part*"):

@@ -1,6 +1,7 @@
 """One job of a sweep: its share of the plan, run by run."""
 
 import ctypes
+import json
 import os
 import platform
 import signal
@@ -119,6 +120,15 @@ def _held(experiment: Experiment, held: Held, on_progress: Callable[..., None]) 
 def failure_row(experiment: Experiment, status: Status) -> Row:
     """Row of a run that left none itself."""
     return {**experiment.labels(""), **status.columns()}
+
+
+def may_run(plan: Path) -> bool:
+    """Whether the planner of a plan lives, as far as this machine can tell."""
+    try:
+        node, planner = json.loads(plan.read_text())["planner"]
+        return node != platform.node() or is_alive(planner)
+    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
+        return True
 
 
 def is_alive(process: int) -> bool:

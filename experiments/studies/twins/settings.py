@@ -1,12 +1,14 @@
 """Constants of the study of twins; the estimators' configuration is in conf/study/twins/*.yaml."""
 
+from pathlib import Path
+
 from experiments.judging.logs import GRAPHS, INTEL_910, MRCLAM_6
 from experiments.judging.results import Profile
 
-LOGS = {  # name: files, and the number of the robot in them
+LOGS: dict[str, tuple[tuple[Path, ...], int | None]] = {  # name: files, and the robot in them
     **{f"MRCLAM 6, robot {robot}": ((MRCLAM_6,), robot) for robot in range(1, 6)},
-    "fr079": ((GRAPHS["fr079"],), 1),
-    "Intel": (INTEL_910, 1),
+    "fr079": ((GRAPHS["fr079"],), None),
+    "Intel": (INTEL_910, None),
 }
 SHOWN = ("MRCLAM 6, robot 1", "MRCLAM 6, robot 2")  # the twin was built on them; others judge
 LANDMARKS, SCANS = "landmarks", "scans"  # kinds of logs

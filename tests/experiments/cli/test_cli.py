@@ -207,7 +207,7 @@ def test_errors_of_a_studys_file_name_it_and_not_its_copy(tmp_path):
         ),
         ("prior.sigma_heading_rad=-1", "prior.sigma_heading_rad"),
         ("prior.sigma_position_m=true", "prior.sigma_position_m must be .*True"),
-        ("prior.track_m=wide", "prior.track_m must be a positive number or null, got 'wide'"),
+        ("prior.track_m=wide", "prior.track_m must be a positive number, or null, got 'wide'"),
         ("prior.wheel_radius_m=0", "prior.wheel_radius_m must be a positive number"),
         ("prior.map={_target_:nosuch.x}", "prior.map._target_=nosuch.x"),
         ("prior.map={_target_:os.getcwd,x:1}", "unknown key prior.map.x"),

@@ -2,6 +2,8 @@
 
 import html
 import json
+import os
+import platform
 import re
 
 import numpy as np
@@ -107,6 +109,7 @@ def test_the_intervals_of_a_decided_sweep_are_drawn_as_they_narrow(tmp_path, chr
 
 def test_a_page_follows_a_sweep_until_it_has_ended(tmp_path, monkeypatch, capsys):
     (tmp_path / "unfinished-1a.txt").write_text("60 estima run -m seed=0,1\n")
+    (tmp_path / "plan-1a.json").write_text(json.dumps({"planner": [platform.node(), os.getpid()]}))
     monkeypatch.setattr(of_sweep, "FOLLOW_S", 0.01)
     seen, page = [], tmp_path / "page.html"
 
@@ -124,9 +127,18 @@ def test_a_page_follows_a_sweep_until_it_has_ended(tmp_path, monkeypatch, capsys
     assert "The sweep of 60 goes on; this page loads again every 0.01 s." in seen[2]
     assert 'http-equiv="refresh"' not in page.read_text()
     assert [line.split(": ")[1] for line in capsys.readouterr().err.splitlines()] == [
+        "no row yet",
         "30 rows",
         "35 rows",
     ]
+
+
+def test_a_page_ends_with_a_sweep_that_was_stopped(tmp_path, monkeypatch, capsys):
+    (tmp_path / "unfinished-1a.txt").write_text("60 estima run -m seed=0,1\n")
+    monkeypatch.setattr(of_sweep, "FOLLOW_S", 0.01)
+    of_sweep.follow(rows, str(tmp_path), tmp_path / "page.html", None)
+    said = capsys.readouterr().err
+    assert said.endswith("the sweep was stopped; go on with\nestima run -m seed=0,1\n")
 
 
 def test_a_page_too_large_is_refused(tmp_path, monkeypatch):

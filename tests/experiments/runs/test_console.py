@@ -101,3 +101,13 @@ def test_an_interrupt_is_said_whatever_it_caused(capsys, monkeypatch):
         console.exit_with(error)
     assert ended.value.code == 130
     assert "3 of 9 runs are kept" in capsys.readouterr().err
+
+
+def test_an_output_that_was_closed_is_named(monkeypatch):
+    closed = io.StringIO()
+    closed.close()
+    monkeypatch.setattr(console.sys, "stdout", closed)
+    with pytest.raises(InputError, match="the standard output is closed, by code of"):
+        console.show("a result")
+    monkeypatch.setattr(console.sys, "stderr", closed)
+    console.warn("nobody reads it")

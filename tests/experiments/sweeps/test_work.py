@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 
@@ -44,3 +45,36 @@ def test_a_worker_in_compiled_code_ends_with_its_planner(name, tmp_path):
         os.kill(worker, signal.SIGKILL)
     assert gone
     assert folder(name).is_dir()
+
+
+_IDLE = """
+import os, sys, time
+from joblib import Parallel, delayed
+from experiments.sweeps.launch import tie_workers
+tie_workers()
+with Parallel(n_jobs=2) as workers:
+    workers(delayed(time.sleep)(0.1) for _ in range(4))
+    print(*workers(delayed(os.getpid)() for _ in range(20)), flush=True)
+    time.sleep(60)
+"""
+
+
+def test_an_idle_worker_ends_with_its_planner():
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
+    with subprocess.Popen([sys.executable, "-c", _IDLE], cwd=ROOT, **pipes) as planner:
+        workers = {int(word) for word in planner.stdout.readline().split()}
+        assert workers
+        assert all(map(is_alive, workers))
+        planner.kill()
+    until = time.monotonic() + 20
+    while any(map(runs, workers)) and time.monotonic() < until:
+        time.sleep(0.05)
+    assert not any(map(runs, workers))
+
+
+def runs(process):
+    """Whether a process runs; one that ended, and that nobody has asked about, does not."""
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
