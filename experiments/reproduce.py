@@ -33,7 +33,7 @@ from experiments.judging.results import Profile, Results, reproduce_command
 from experiments.judging.sentences import Conclusion, conclude
 from experiments.report.page import write_report
 from experiments.runs.console import pluralize, progress, show, warn
-from experiments.runs.dependencies.recorder import recorded
+from experiments.runs.dependencies.recorder import digest_of_all, recorded
 from experiments.runs.paths import results, short
 from experiments.viewing.style import save_figure
 from sim.errors import InputError
@@ -198,7 +198,8 @@ def redraw(only: str | None = None) -> None:
 def reproduce_paper(paper: str, profile: Profile) -> list[Conclusion]:
     """Run one paper's study, and put its files, claims, verdicts and origin in place.
 
-    The files are written elsewhere first, so an interrupted run leaves the results as they were.
+    The files are written elsewhere first, so an interrupted run leaves the results as they were;
+    run again by the same code, it goes on with the tables of the jobs that it had finished.
     """
     begun, place = time.monotonic(), results()
     aside = results() / "cache"  # which is not committed
@@ -207,6 +208,10 @@ def reproduce_paper(paper: str, profile: Profile) -> list[Conclusion]:
         made = Results(Path(name), paper)
         study = _part(paper, "study")
         with progress(paper, 1.0) as on_progress, recorded(study.__name__) as seen:
+            code = digest_of_all(seen.digests())
+            seen.keep_in = aside / f"unfinished-{paper}-{profile}-{code}"
+            if seen.keep_in.exists():
+                warn(f"{paper}: goes on with the {_count(seen.keep_in)} that are done")
             study.run(profile, made, on_progress)
         items = table_dependencies(seen, made.folder)
         items |= _drawn_items(made)
@@ -216,7 +221,13 @@ def reproduce_paper(paper: str, profile: Profile) -> list[Conclusion]:
         _write(claims, conclusions, place, paper, profile)
         note_provenance(place, paper, profile, time.monotonic() - begun)
         note_built(place, paper, items | verdicts, only_these=True)
+    for left in aside.glob(f"unfinished-{paper}-{profile}-*"):
+        shutil.rmtree(left, ignore_errors=True)
     return conclusions
+
+
+def _count(folder: Path) -> str:
+    return pluralize(sum(1 for _ in folder.glob("*.json")), "job")
 
 
 def _drawn_items(made: Results) -> Items:

@@ -1,8 +1,9 @@
 """The jobs of a study: which runs go together, how all cores share them, and their tables."""
 
 import time
-from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Sequence
 from itertools import chain
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
@@ -10,9 +11,12 @@ import pandas as pd
 from joblib import Parallel, delayed
 from numpy.typing import ArrayLike
 
+from experiments.judging.kept_jobs import Tables as Tables
+from experiments.judging.kept_jobs import file_of, keep, kept
 from experiments.runs.dependencies.recorder import (
     Digests,
     is_recording,
+    kept_in,
     note,
     note_part,
     recorded,
@@ -25,7 +29,6 @@ from sim.team import Team
 
 T = TypeVar("T")
 Progress = Callable[[float], None]  # called with the share done
-Tables = Mapping[str, Sequence[Row] | pd.DataFrame]  # rows by the table's name
 
 
 def in_parallel(
@@ -43,20 +46,17 @@ def in_parallel(
     costs
         How long each job takes, in any unit; None if all take the same.
     """
-    for result, dependencies, _ in _recorded_jobs(function, jobs, on_progress, costs):
+    calls = [delayed(_recorded_job)(function, job, is_recording()) for job in jobs]
+    for result, dependencies, _ in _in_turn(calls, on_progress, costs):
         note(dependencies)
         yield result
 
 
-def _recorded_jobs(
-    function: Callable[..., T],
-    jobs: Sequence[Sequence[Any]],
-    on_progress: Progress,
-    costs: ArrayLike | None,
-) -> Iterator[tuple[T, Digests, float]]:
+def _in_turn(
+    calls: Sequence[Any], on_progress: Progress, costs: ArrayLike | None
+) -> Iterator[tuple[Any, Digests, float]]:
     """Yield results, what each depends on and the seconds that it took."""
-    done = np.cumsum(np.ones(len(jobs)) if costs is None else costs)
-    calls = (delayed(_recorded_job)(function, job, is_recording()) for job in jobs)
+    done = np.cumsum(np.ones(len(calls)) if costs is None else costs)
     results = Parallel(n_jobs=-1, return_as="generator")(calls)
     for share, result in zip(done / done[-1], results, strict=True):
         yield result
@@ -74,15 +74,37 @@ def _recorded_job(
     return result, seen.digests(), time.monotonic() - begun
 
 
+def _kept_job(
+    function: Callable[..., Tables], job: Sequence[Any], wanted: bool, file: Path | None
+) -> tuple[Tables, Digests, float]:
+    """As `_recorded_job`, but from the file if it has the tables; else they are kept in it."""
+    found = kept(file) if file is not None else None
+    if found is None:
+        found = _recorded_job(function, job, wanted)
+        if file is not None:
+            keep(file, *found)
+            found = kept(file) or found  # so that a study that goes on has the same bytes
+    return found
+
+
 def tables_of(
     function: Callable[..., Tables],
     jobs: Sequence[Sequence[Any]],
     on_progress: Progress = lambda _: None,
     costs: ArrayLike | None = None,
 ) -> dict[str, pd.DataFrame]:
-    """Run jobs by `in_parallel` and join the rows that they give, by table, in their order."""
+    """Run jobs in parallel and join the rows that they give, by table, in their order.
+
+    Within a recording that keeps jobs, what an interrupted run has finished is not run again.
+    """
+    folder, wanted = kept_in(), is_recording()
+    files = [folder and file_of(folder, function, job) for job in jobs]
+    calls = [
+        delayed(_kept_job)(function, job, wanted, file)
+        for job, file in zip(jobs, files, strict=True)
+    ]
     parts: dict[str, list[Any]] = {}
-    for tables, dependencies, seconds in _recorded_jobs(function, jobs, on_progress, costs):
+    for tables, dependencies, seconds in _in_turn(calls, on_progress, costs):
         for name, rows in tables.items():
             parts.setdefault(name, []).append(rows)
             note_part(name, dependencies, seconds)

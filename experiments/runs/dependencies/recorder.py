@@ -45,12 +45,15 @@ class Recorder:
         What other processes, or the cache, have recorded.
     parts
         What each table depends on besides, and the seconds that it took, by its name.
+    keep_in
+        Folder for the tables of jobs that are finished; None to keep none.
     """
 
     def __init__(self, *modules: str) -> None:
         self.modules = set(modules)
         self.noted: dict[str, str] = {}
         self.parts: dict[str, tuple[dict[str, str], float]] = {}
+        self.keep_in: Path | None = None
         self.read = set[str]()
         self.written = set[str]()
         self.commands: list[tuple[str, tuple[str, ...], str | None]] = []
@@ -143,6 +146,11 @@ def note_part(name: str, digests: Digests, seconds: float) -> None:
 def is_recording() -> bool:
     """Whether anything is being recorded."""
     return bool(_WATCH.recorders)
+
+
+def kept_in() -> Path | None:
+    """Folder of the innermost recorder that keeps the tables of finished jobs, if any."""
+    return next((r.keep_in for r in reversed(_WATCH.recorders) if r.keep_in), None)
 
 
 def digest_of_all(digests: Digests) -> str:
