@@ -184,9 +184,26 @@ class FreeSettings:
 
     @property
     def drawn_anchor(self) -> Anchor | None:
-        """The anchor that a figure shows: of several data sets, the first one's."""
-        first = next(iter(self.printed.values()), None)
-        return first.anchor if first and not self.is_alone else self.anchor
+        """The anchor that a figure shows; None if it does not know each setting."""
+        at = self.anchor
+        return at if at and {s.name for s in self.settings_apart} <= set(at.settings) else None
+
+    @property
+    def places(self) -> tuple[str, ...]:
+        """The data sets, if there are several: each has settings of its own."""
+        return tuple(self.printed) if len(self.printed) > 1 else ()
+
+    @property
+    def settings_apart(self) -> tuple[Setting, ...]:
+        """The settings of each data set, one data set after another."""
+        return (
+            tuple(
+                replace(each, name=f"{each.name} ({place})", words=f"{each.called} ({place})")
+                for place in self.places
+                for each in self.settings
+            )
+            or self.settings
+        )
 
 
 def free_settings(study: str) -> dict[str, FreeSettings]:

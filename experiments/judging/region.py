@@ -66,19 +66,24 @@ class Fitted:
     ----------
     means
         For each headline, means (1 + B, P) at the points: first those found, then the resampled.
+    columns
+        For each headline, the settings that its surface takes; of several data sets, its own.
     """
 
     settings: tuple[Setting, ...]
     sides: tuple[Side, ...]
     surfaces: tuple[Surface, ...]
     means: tuple[Array, ...]
+    columns: tuple[slice, ...]
+
+    def logs(self, headline: int, units: Array) -> Array:
+        """Log ratio (1 + B, N) of a headline at places (N, D)."""
+        weights = self.surfaces[headline].weights(units[:, self.columns[headline]])
+        return np.asarray(self.means[headline] @ weights.T)
 
     def margins(self, units: Array) -> Array:
         """Margin (1 + B, N) of the worst headline at places (N, D)."""
-        parts = [
-            side.margin(means @ surface.weights(units).T)
-            for side, surface, means in zip(self.sides, self.surfaces, self.means, strict=True)
-        ]
+        parts = [side.margin(self.logs(i, units)) for i, side in enumerate(self.sides)]
         return np.asarray(np.minimum.reduce(parts))
 
 
@@ -168,7 +173,8 @@ def fit(
         surfaces.append(fit_surface(units, found, are_choices(settings)))
         means.append(np.vstack([found, found + picked.mean(axis=2)]))
     sides = tuple(side for _, side in headlines)
-    return Fitted(tuple(settings), sides, tuple(surfaces), tuple(means))
+    columns = tuple(slice(None) for _ in headlines)
+    return Fitted(tuple(settings), sides, tuple(surfaces), tuple(means), columns)
 
 
 def share(fitted: Fitted) -> Interval:

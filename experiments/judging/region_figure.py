@@ -97,7 +97,7 @@ def _draw_line(
     u = np.linspace(0.0, 1.0, _N_GRID)
     units = np.tile(np.full(len(fitted.settings), 0.5) if place is None else place, (_N_GRID, 1))
     units[:, i] = u
-    logs = fitted.means[0] @ fitted.surfaces[0].weights(snap(fitted.settings, units)).T
+    logs = fitted.logs(0, snap(fitted.settings, units))
     low, high = np.exp(np.quantile(logs[1:], [0.025, 0.975], axis=0))
     ax.fill_between(u, low, high, color=BLUE, alpha=0.25, lw=0)
     ax.plot(u, np.exp(logs[0]), color=BLUE, label="found")

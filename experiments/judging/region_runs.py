@@ -7,7 +7,7 @@ settings share it (`like` in the design).
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -48,6 +48,8 @@ class Compared:
         The criterion, as a ratio.
     printed
         The paper's own ratio, if it prints one.
+    place
+        Its data set, where the claim's settings belong to one of several.
     """
 
     first: str
@@ -56,6 +58,7 @@ class Compared:
     at_least: float = 0.0
     at_most: float = math.inf
     printed: float | None = None
+    place: str = ""
 
     def logs(self, table: pd.DataFrame) -> Array:
         """Log ratio of each row; not finite where a run failed."""
@@ -163,7 +166,24 @@ def fitted_regions(
             (logs[kept].reshape(len(points), -1), each.side(free.effect))
             for logs, each in zip(every, headlines[claim], strict=True)
         ]
-        yield claim, free, points, fit(free.settings, points, arms, stream(0, f"region/{claim}"))
+        fitted = fit(free.settings, points, arms, stream(0, f"region/{claim}"))
+        yield (
+            claim,
+            free,
+            *set_apart(free, points, fitted, [each.place for each in headlines[claim]]),
+        )
+
+
+def set_apart(
+    free: FreeSettings, points: pd.DataFrame, fitted: Fitted, places: Sequence[str]
+) -> tuple[pd.DataFrame, Fitted]:
+    """The same with settings of each data set's own, if there are several; they were run alike."""
+    if not free.places:
+        return points, fitted
+    n, apart = len(free.settings), free.settings_apart
+    columns = tuple(slice(k * n, (k + 1) * n) for k in map(free.places.index, places))
+    values = {each.name: points[free.settings[i % n].name] for i, each in enumerate(apart)}
+    return pd.DataFrame(values), replace(fitted, settings=apart, columns=columns)
 
 
 def judged_regions(results: Results, headlines: Headlines) -> dict[str, Region]:

@@ -53,8 +53,15 @@ _WORST_MX2 = f"error with 2 or 8 particles a node over 4, within {_EQUAL:g}"
 def _both(first: str, second: str, words: str, most: float, least: float = 0.0) -> list[Compared]:
     """A headline on each route, the columns named without it."""
     return [
-        Compared(f"{route}_{first}", f"{route}_{second}", f"{words}, {PLACES[route]}", least, most)
-        for route in ("oxford", "umh")
+        Compared(
+            f"{route}_{first}",
+            f"{route}_{second}",
+            f"{words}, {PLACES[route]}",
+            least,
+            most,
+            place=place,
+        )
+        for route, place in (("oxford", "Oxford"), ("umh", "UMH"))
     ]
 
 
@@ -65,13 +72,13 @@ def _printed(name: str, method: str, over: str) -> float:
 HEADLINES: Headlines = {
     "MX1": [
         Compared("oxford_m2_m", "oxford_m1_m", "M2 / M1, Oxford", at_most=1.0,
-                 printed=_printed("oxford", "M2", "M1")),
+                 printed=_printed("oxford", "M2", "M1"), place="Oxford"),
         Compared("oxford_m3_m", "oxford_m2_m", "M3 / M2, Oxford", at_least=_FAILS,
-                 printed=_printed("oxford", "M3", "M2")),
+                 printed=_printed("oxford", "M3", "M2"), place="Oxford"),
         Compared("umh_m2_m", "umh_m1_m", "M2 / M1, UMH", at_most=1.0,
-                 printed=_printed("umh", "M2", "M1")),
+                 printed=_printed("umh", "M2", "M1"), place="UMH"),
         Compared("umh_m3_m", "umh_m2_m", "M3 / M2, UMH", 1.0 / _HOLDS, _HOLDS,
-                 printed=_printed("umh", "M3", "M2")),
+                 printed=_printed("umh", "M3", "M2"), place="UMH"),
     ],
     "MX2": [
         headline

@@ -10,7 +10,16 @@ from experiments.evaluation.statistics import Interval
 from experiments.judging import anchors
 from experiments.judging.claim import Subject, judge_bounds, own_design, waiting
 from experiments.judging.folders import NAMED, PAPERS, findings, part
-from experiments.judging.free_settings import free_settings, sample
+from experiments.judging.free_settings import (
+    Anchor,
+    FreeSettings,
+    Printed,
+    Scale,
+    Setting,
+    free_settings,
+    sample,
+)
+from experiments.judging.region import Side, fit, share
 from experiments.judging.region_runs import (
     Compared,
     judge_tables,
@@ -18,11 +27,13 @@ from experiments.judging.region_runs import (
     region_jobs,
     region_pages,
     remake_region,
+    set_apart,
 )
 from experiments.judging.results import FIRST_SEED, Profile, Results
 from experiments.judging.sentences import WAITING, conclude
 from experiments.judging.sequential import run_worlds
 
+BELOW = Side(high=0.0)
 STUDY, CLAIM = "decristoforis2020", "DC2"
 KEY = "estimator.neighbours"
 HEADLINES = {
@@ -161,3 +172,21 @@ def test_the_sample_is_the_same_each_time():
     settings = free_settings(STUDY)[CLAIM].settings
     first, second = (sample(settings, 8, rng=np.random.default_rng(1)) for _ in range(2))
     pd.testing.assert_frame_equal(first, second)
+
+
+def test_data_sets_have_settings_of_their_own():
+    """Two claims' sides that no one setting meets, but one for each data set does."""
+    setting = Setting("B", Scale.LINEAR, 0.0, 1.0, "")
+    at = Anchor({"B": 0.5})
+    printed = {place: Printed("x", 1.0, at) for place in ("A", "B")}
+    free = FreeSettings((setting,), "X", printed=printed)
+    points = sample((setting,), 16, rng=np.random.default_rng(0))
+    rng, here = np.random.default_rng(1), points["B"].to_numpy()[:, None]
+    noise = rng.normal(0.0, 0.01, (16, 3))
+    arms = [(here - 0.6 + noise, BELOW), (0.4 - here + noise, BELOW)]
+    together = fit((setting,), points, arms, rng)
+    drawn, apart = set_apart(free, points, together, ["A", "B"])
+    assert [each.name for each in apart.settings] == list(drawn) == ["B (A)", "B (B)"]
+    assert share(together).value < 0.2
+    assert share(apart).value == pytest.approx(0.25, abs=0.1)  # half of each
+    assert free.drawn_anchor.settings == {"B (A)": 0.5, "B (B)": 0.5}
