@@ -151,7 +151,11 @@ def view(
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option("--out", "-o", help="File to write: .mp4, .gif, .html; a world or map: .png."),
+        typer.Option(
+            "--out",
+            "-o",
+            help="File to write: .mp4, .gif, .html, .rrd (for Rerun); a world or map: .png.",
+        ),
     ] = None,
     seconds: Annotated[
         float | None,
@@ -171,6 +175,8 @@ def view(
       estima view run.npz --estimate fastslam -o run.html
 
       estima view run.npz --estimate mcl prior.map=world estimator.max_particles=2000 -o run.mp4
+
+      estima view run.npz --estimate ekf_icp -o run.rrd
 
       estima view --world world=office seed=3 -o office.png
 

@@ -1,4 +1,4 @@
-"""Files of an animation: MP4, GIF, or an HTML page."""
+"""Files of an animation: MP4, GIF, an HTML page, or a recording for Rerun."""
 
 import shutil
 import subprocess
@@ -9,38 +9,41 @@ from typing import Any
 from experiments.viewing.animation import Picture, pictures
 from experiments.viewing.playback import Playback
 from experiments.viewing.player import write_page
+from experiments.viewing.rerun_file import check_installed, write_rerun
 from sim.errors import require
 from sim.files import check_writable, write_whole
 
 
 def check_output(path: Path) -> None:
     """Refuse a file that could not be written, before anything is computed."""
-    kinds = (*_WRITERS, ".html")
+    kinds = (*_WRITERS, *_PAGES)
     require(path.suffix in kinds, f"{path}: animations are {', '.join(kinds)}")
     require(
         path.suffix != ".mp4" or shutil.which("ffmpeg") is not None,
         f"{path}: MP4 needs ffmpeg, which is not installed; take .gif or .html",
     )
+    if path.suffix == ".rrd":
+        check_installed(path)
     check_writable(path)
 
 
 def save(
     run: Playback, path: Path, on_progress: Callable[[float], None], title: str = "A run"
 ) -> None:
-    """Write a run as `.mp4` (needs ffmpeg), `.gif` or `.html`, whole or not at all.
+    """Write a run as `.mp4` (needs ffmpeg), `.gif`, `.html` or `.rrd`, whole or not at all.
 
     Parameters
     ----------
     on_progress
         Called with the share done.
     title
-        Of an `.html`.
+        Of an `.html` or `.rrd`.
     """
     check_output(path)
 
     with write_whole(path) as part:
-        if path.suffix == ".html":
-            write_page(run, part, on_progress, title)
+        if path.suffix in _PAGES:
+            _PAGES[path.suffix](run, part, on_progress, title)
         else:
             _WRITERS[path.suffix](run, _counted(run, on_progress), part)
 
@@ -87,3 +90,4 @@ def _write_gif(run: Playback, images: Iterator[Picture], path: Path) -> None:
 
 
 _WRITERS = {".mp4": _write_mp4, ".gif": _write_gif}
+_PAGES = {".html": write_page, ".rrd": write_rerun}  # that draw by themselves

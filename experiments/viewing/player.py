@@ -23,7 +23,7 @@ from sim.arrays import Array
 from sim.worlds.grid import OccupancyGrid
 
 _PLAYER = Path(__file__).parent / "player.html"
-_PATHS = (" truth", " estimate")  # layers that grow from picture to picture
+PATHS = (" truth", " estimate")  # layers that grow from picture to picture
 _GAP = 65535  # stands for NaN among whole numbers of two bytes
 _MARGIN = 0.5  # of the map's sides, around it: what lies farther out is not shown
 _MOST_ERRORS = 1500  # of a curve
@@ -54,9 +54,9 @@ def write_page(
         "stamps": (run.stamps - run.stamps[0]).round(4).tolist(),
         "fps": round(run.fps, 4),
         "grid": None if run.grid is None else _underlay(run.grid),
-        "still": _still(run),
+        "still": still(run),
         "layers": [_layer(name, layer, points[name], around) for name, layer in shown.items()],
-        "errors": _errors(run),
+        "errors": error_curves(run),
     }
     text = json.dumps(data, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
     page = _PLAYER.read_text(encoding="utf-8")
@@ -70,7 +70,7 @@ def _layer(name: str, layer: Layer, points: list[Array], around: Bounds) -> dict
 
     Of a path that grows, the points are those of the last picture.
     """
-    grows = name.endswith(_PATHS)
+    grows = name.endswith(PATHS)
     flat = points[-1] if grows else np.concatenate(points)
     lengths = [len(each) for each in points]
     return {
@@ -103,7 +103,7 @@ def _packed(points: Array, around: Bounds) -> dict[str, Any]:
     }
 
 
-def _still(run: Playback) -> list[dict[str, Any]]:
+def still(run: Playback) -> list[dict[str, Any]]:
     """What never moves: walls (W, 4), those of the map if they differ, and landmarks (N, 2), m."""
     recording = run.robots[0].recording
     world = recording.world
@@ -135,7 +135,7 @@ def _underlay(grid: OccupancyGrid) -> dict[str, Any]:
     }
 
 
-def _errors(run: Playback) -> list[dict[str, Any]]:
+def error_curves(run: Playback) -> list[dict[str, Any]]:
     """Curves of all estimates whose errors are known; those of a robot alone have names."""
     start, alone = float(run.stamps[0]), run.robots[0]
     if len(run.robots) > 1:

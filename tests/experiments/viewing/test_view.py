@@ -285,7 +285,7 @@ def test_from_the_command_line(recording, tmp_path, monkeypatch):
     assert "4 pictures" in done.stdout
     for arguments, words in (
         ([log], "no display"),
-        ([log, "-o", "run.avi"], ".mp4, .gif, .html"),
+        ([log, "-o", "run.avi"], ".mp4, .gif, .html, .rrd"),
         ([log, "-e", "odometry", "-e", "icp_odometry"], "several estimates are drawn in files"),
         ([log, "estimator.kr=1", "-o", out], "--estimate"),
         ([log, "-e", str(tmp_path / "kept"), "estimator.kr=1", "-o", out], "overrides"),
