@@ -122,6 +122,7 @@ def write_sweep_page(
             {
                 "spec": read_yaml(TEMPLATES / "chart.yaml"),
                 "narrowing": _narrowing(decided),
+                "parallel": read_yaml(TEMPLATES / "parallel.yaml"),
                 "settings": settings,
                 "metrics": [_metric(every[c], c, place) for c in metrics],
                 "revised": (every[PATH] == "revised").astype(int).tolist(),

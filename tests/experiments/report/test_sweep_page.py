@@ -436,3 +436,48 @@ def test_phones_and_dark_mode(tab, dark):
     label = "document.querySelector('#chart .role-axis-label text')"
     assert tab.becomes(f"getComputedStyle({label}).fill == '{ink}'")
     assert tab.complaints() == []
+
+
+@pytest.fixture
+def many_settings(tmp_path, chromium):
+    """A page of a sweep over three settings and a seed."""
+    table = rows()
+    n = len(table)
+    table["robot.kr"] = np.resize([1e-5, 1e-4], n)
+    table["sensors.laser.n_beams"] = np.resize([61, 61, 121], n)
+    write_sweep_page(table, "mine", tmp_path, tmp_path / "page.html")
+    chromium.events.clear()
+    chromium.shape(1400, 900)
+    chromium.open((tmp_path / "page.html").as_uri())
+    chromium.js("drawn.then(() => drawnParallel)")
+    return chromium
+
+
+def test_all_settings_are_drawn_at_once(many_settings):
+    assert not many_settings.js("byId('together').hidden")
+    assert many_settings.js("document.querySelector('#parallel canvas') !== null")
+    assert "A line for each run, from" in many_settings.js("byId('lines').textContent")
+    assert many_settings.complaints() == []
+
+
+def test_a_phone_has_no_room_for_all_settings(many_settings):
+    many_settings.shape(390, 844)
+    many_settings.js("draw()")
+    assert many_settings.js("byId('together').hidden")
+
+
+def test_runs_that_are_picked_stand_side_by_side(many_settings):
+    many_settings.js("[3, 5, 5, 7].forEach((row) => pick({ row }))")
+    found = many_settings.js(
+        "[...document.querySelectorAll('.compared tr')]"
+        ".map((r) => [...r.cells].map((c) => c.textContent))"
+    )
+    assert [len(line) for line in found] == [4] * len(found)
+    names = [line[0] for line in found]
+    assert names[:2] == ["run", "ended"]
+    assert Y in names
+    many_settings.js("document.querySelector('#picked > button').click()")
+    assert many_settings.js("byId('picked').textContent") == ""
+    many_settings.js("[1, 2, 3, 4, 5].forEach((row) => pick({ row }))")
+    assert many_settings.js("document.querySelector('.compared tr').cells.length") == 5
+    assert many_settings.complaints() == []
