@@ -1,5 +1,7 @@
 """Where a claim holds over the two settings that decide it most."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
@@ -27,19 +29,20 @@ def draw_region(
     anchor: Anchor | None,
     *,
     title: str,
-    quantity: str,
-    printed: float | None = None,
+    quantities: Sequence[str],
+    printed: Sequence[float | None],
 ) -> Figure:
-    """Draw where a claim holds, its first headline's ratio along the first setting, what decides.
+    """Draw where a claim holds, its critical ratio along the setting that decides, what decides.
 
     Parameters
     ----------
     points
         The sampled settings.
-    quantity
-        The first headline's ratio, in words.
+    quantities
+        The headlines' ratios, in words. Drawn is the one farthest from the claim's side, of those
+        that depend on the setting.
     printed
-        The paper's own ratio; None if it prints none.
+        The paper's own ratios; None where it prints none.
     """
     indices = first_order(fitted)
     order = [int(i) for i in indices[0].argsort()[::-1]]
@@ -49,8 +52,9 @@ def draw_region(
         place = units_of(fitted.settings, pd.DataFrame([dict(anchor.settings)]))[0]
     sampled = units_of(fitted.settings, points)
     _draw_map(axes[0], fitted, sampled, place, (order[0], order[min(1, len(order) - 1)]))
-    _draw_line(axes[1], fitted, place, order[0], printed)
-    axes[1].set_ylabel(literal(quantity))
+    critical = _critical(fitted, place, order[0])
+    _draw_line(axes[1], fitted, critical, place, order[0], printed[critical])
+    axes[1].set_ylabel(literal(quantities[critical]))
     for row, i in enumerate(reversed(order)):
         low, high = np.quantile(indices[1:, i], [0.025, 0.975])
         draw_interval(axes[2], row, Interval(indices[0, i], low, high), along="x", color=BLUE)
@@ -90,18 +94,31 @@ def _draw_map(
         ax.set(yticks=[], ylabel="")
 
 
+def _critical(fitted: Fitted, place: Array | None, i: int) -> int:
+    """The headline that is farthest from the claim's side, of those that depend on a setting."""
+    at = np.full((1, len(fitted.settings)), 0.5) if place is None else place[None]
+    every = range(len(fitted.settings))
+    margins = {
+        k: float(side.margin(fitted.logs(k, at))[0, 0])
+        for k, side in enumerate(fitted.sides)
+        if i in every[fitted.columns[k]]
+    }
+    return min(margins, key=margins.__getitem__)
+
+
 def _draw_line(
-    ax: Axes, fitted: Fitted, place: Array | None, i: int, printed: float | None
+    ax: Axes, fitted: Fitted, headline: int, place: Array | None, i: int, printed: float | None
 ) -> None:
-    """Draw the first headline's ratio along a setting, the others at the anchor or their middle."""
+    """Draw a headline's ratio along a setting, the others at the anchor or their middle."""
     u = np.linspace(0.0, 1.0, _N_GRID)
     units = np.tile(np.full(len(fitted.settings), 0.5) if place is None else place, (_N_GRID, 1))
     units[:, i] = u
-    logs = fitted.logs(0, snap(fitted.settings, units))
+    logs = fitted.logs(headline, snap(fitted.settings, units))
     low, high = np.exp(np.quantile(logs[1:], [0.025, 0.975], axis=0))
     ax.fill_between(u, low, high, color=BLUE, alpha=0.25, lw=0)
     ax.plot(u, np.exp(logs[0]), color=BLUE, label="found")
-    limits = [v for v in (fitted.sides[0].low, fitted.sides[0].high) if np.isfinite(v)]
+    side = fitted.sides[headline]
+    limits = [v for v in (side.low, side.high) if np.isfinite(v)]
     for limit in limits:
         ax.axhline(np.exp(limit), color=BLACK, lw=0.8, ls="--", label="criterion")
     if printed is not None:

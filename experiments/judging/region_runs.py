@@ -199,7 +199,8 @@ def region_pages(results: Results, headlines: Headlines) -> dict[str, Figure]:
     return {
         f"{results.paper}_region_{claim}": draw_region(
             fitted, points, free.drawn_anchor, title=f"Where {claim} holds",
-            quantity=headlines[claim][0].words, printed=headlines[claim][0].printed,
+            quantities=[each.words for each in headlines[claim]],
+            printed=[each.printed for each in headlines[claim]],
         )
         for claim, free, points, fitted in fitted_regions(results, headlines)
     }  # fmt: skip

@@ -223,14 +223,15 @@ def test_a_verdict_by_region_is_written_and_read(tmp_path):
 def test_the_figure_shows_region_anchor_and_the_papers_number():
     fitted, rng = planted(sloped, 11)
     points = sample(CUBE, 64, rng=rng)
-    page = draw_region(fitted, points, middle(CUBE), title="t", quantity="a ratio", printed=0.8)
+    about = {"quantities": ["a ratio"], "printed": [0.8]}
+    page = draw_region(fitted, points, middle(CUBE), title="t", **about)
     first, line, what = page.axes
     assert (first.get_xlabel(), line.get_ylabel()) == ("a", "a ratio")
     assert what.get_yticklabels()[-1].get_text() == "a"  # the most deciding on top
     assert {text.get_text() for text in page.legends[0].get_texts()} >= {"anchor", "boundary"}
     assert "the paper's" in {text.get_text() for text in line.get_legend().get_texts()}
     flat = planted(nothing, 12, settings=CUBE[:1])[0]
-    draw_region(flat, points, None, title="$", quantity="a ratio")
+    draw_region(flat, points, None, title="$", quantities=["a ratio"], printed=[None])
 
 
 def test_criteria_say_since_when_and_whether_after_the_data(monkeypatch):
