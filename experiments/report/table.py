@@ -75,6 +75,8 @@ def notes(found: pd.DataFrame, against: str | None) -> str:
         parts.append(f"Too few recordings to test what differs from {against}.")
     elif against:
         parts.append(f"Nothing differs from {against} by paired tests.")
+    if against:
+        parts.append("The interval of a ratio holds 95 % by itself, without Holm's correction.")
     if BELOW in found:
         parts.append("Over bound: pooled RMS over the least of any method, by simulation's laws.")
         if found[BELOW].any():

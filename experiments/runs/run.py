@@ -166,6 +166,8 @@ _SHOWN = (
 )
 
 
+_SUMMARIZED = ("distance_m", "ate_rmse_m", "nees_mean")  # by `summarize`
+_REVISED_ERROR = f"{REVISED}ate_rmse_m"
 _CONSISTENT = (1.5, 6.0)  # mean NEES of a run, half and twice the expected
 _CONSISTENCY = ("too cautious", "consistent", "too sure of itself")
 _DOF = 3
@@ -188,7 +190,8 @@ def _print(rows: Sequence[Row], files: Sequence[Path]) -> None:
     if first.get("stamps_left_out"):
         scored, left_out = first["stamps_scored"], first["stamps_left_out"]
         show(f"  scored at {scored:.0f} frames; {left_out:.0f} others have no true pose")
-    for name in _SHOWN:
+    said = () if not words or any(_REVISED_ERROR in row for row in sound) else _SUMMARIZED
+    for name in (name for name in _SHOWN if name not in said):
         values = [float(v) for row in sound if isinstance(v := row.get(name), (int, float))]
         if values:
             column, mean = COLUMNS[name], fmean(values)
@@ -211,7 +214,7 @@ def summarize(rows: Sequence[Row]) -> str:
     distance_m, nees = mean("distance_m"), mean("nees_mean")
     if not math.isfinite(error_m):
         return ""
-    revised = any(f"{REVISED}ate_rmse_m" in row for row in rows)
+    revised = any(_REVISED_ERROR in row for row in rows)
     words = f"{'revised path: ' if revised else ''}position RMSE {error_m:.3g} m"
     if distance_m > 0.0:
         words += f", {100.0 * error_m / distance_m:.2g} % of {distance_m:.3g} m"
