@@ -9,6 +9,8 @@ from pathlib import Path
 
 from experiments.runs.paths import SOURCE
 
+_CPU = ("model name", "cpu family", "model")  # in /proc/cpuinfo
+
 
 @functools.cache
 def code_version() -> str:
@@ -37,7 +39,18 @@ def describe_machine() -> dict[str, str | int]:
 
 
 def _cpu_model() -> str:
-    """Name of the processor, from the kernel if it gives one, else from the platform."""
-    info = Path("/proc/cpuinfo")
-    named = re.search(r"^model name\s*: (.*)$", info.read_text() if info.exists() else "", re.M)
-    return named[1].strip() if named else platform.processor() or platform.machine()
+    """Name of the processor, from the kernel if it gives one, else from the platform.
+
+    A virtual machine may name all generations alike, which round differently: family and model
+    tell them apart.
+    """
+    path = Path("/proc/cpuinfo")
+    info = path.read_text() if path.exists() else ""
+    parts = (re.search(rf"^{key}\s*: (.*)$", info, re.M) for key in _CPU)
+    name, *numbers = [each[1].strip() if each else "" for each in parts]
+    told = ", ".join(
+        f"{key.removeprefix('cpu ')} {n}" for key, n in zip(_CPU[1:], numbers, strict=True) if n
+    )
+    if not name:
+        return platform.processor() or platform.machine()
+    return f"{name} ({told})" if told else name
