@@ -34,6 +34,7 @@ from experiments.judging.sentences import Conclusion, conclude
 from experiments.report.page import write_report
 from experiments.runs.console import pluralize, progress, show, warn
 from experiments.runs.dependencies.recorder import digest_of_all, recorded
+from experiments.runs.evaluate import limit_blas
 from experiments.runs.paths import results, short
 from experiments.viewing.style import save_figure
 from sim.errors import InputError
@@ -254,8 +255,9 @@ def _judged_items(made: Results) -> tuple[Items, list[Claim], list[Conclusion]]:
 def judgement(made: Results) -> tuple[list[Claim], list[Conclusion]]:
     """Statistics of a paper's claims by its tables, and the one verdict on each claim."""
     part = _part(made.paper, "claims")
-    claims = part.judge(made)
-    regions = part.regions(made) if hasattr(part, "regions") else {}
+    with limit_blas():
+        claims = part.judge(made)
+        regions = part.regions(made) if hasattr(part, "regions") else {}
     return claims, conclude(claims, findings(made.paper), regions)
 
 
@@ -270,7 +272,8 @@ def _write(
 
 def _draw(made: Results) -> int:
     """Draw a study's figures; return how many there are."""
-    pages = _part(made.paper, "figures").draw(made)
+    with limit_blas():
+        pages = _part(made.paper, "figures").draw(made)
     for title, page in pages.items():
         save_figure(page, made.folder / "figures" / f"{title}.png")
     return len(pages)

@@ -4,6 +4,9 @@ import os
 
 import pytest
 
+# Before NumPy is loaded: threads of several workers' BLAS wait for one another, ten times as long.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 
 @pytest.fixture(scope="session", autouse=True)
 def _results(tmp_path_factory, worker_id_or_none):
