@@ -16,7 +16,8 @@ from experiments.gate.suite import Suite, command_of, draw_run, read_suite, suit
 from experiments.report.export import escape_markdown, to_markdown
 from experiments.runs.columns import COLUMNS
 from experiments.runs.console import progress, show, warn
-from experiments.runs.paths import results, short
+from experiments.runs.paths import is_trusting, results, short
+from experiments.sweeps.commands import config_dir_option
 from sim.errors import InputError, printable, require
 from sim.files import write_text
 
@@ -58,9 +59,10 @@ def run_check(
             show(f"copied, unchanged: {short(path)}")
         left = [f for f in accepted.findings if f.alarms and f.baseline == "release"]
         if left and not release:
+            again = command_again(suite, left, candidate, config_dir)
             show(
                 "worse than the release baseline, and checks will say so until you pin it again: "
-                f'estima check{_options(suite, left)} --accept "REASON" --release'
+                f'{again} --accept "REASON" --release'
             )
         return False
     require(not release, "--release goes with --accept REASON")
@@ -78,7 +80,9 @@ def run_check(
         )
     with progress("checking the estimators", 1.0) as on_progress:
         findings = check(suite, only, on_progress, candidate, config_dir)
-    show(as_text(findings, detectable, hint=_hint(suite, findings)))
+    again = command_again(suite, [f for f in findings if f.alarms], candidate, config_dir)
+    hint = f'if it is intended: {again} --accept "REASON"'
+    show(as_text(findings, detectable, hint=hint))
     show(_where_to_look(read_suite(suite_path(suite), config_dir), findings))
     if junit is not None:
         write_text(junit, as_junit(findings))
@@ -120,17 +124,20 @@ def smallest_found() -> dict[str, float]:
         ) from error
 
 
-def _options(suite: str, findings: Sequence[Finding]) -> str:
-    """Options of `estima check` that name the suite, if it is another one, and the estimators."""
+def command_again(
+    suite: str, findings: Sequence[Finding], candidate: Path | None, config_dir: Path | None
+) -> str:
+    """The same command for the estimators of some findings."""
     names = dict.fromkeys(finding.estimator for finding in findings)
-    chosen = [] if is_main(suite) else ["--suite", suite]
-    return " ".join(["", *chosen, *(f"--only {shlex.quote(name)}" for name in names)])
-
-
-def _hint(suite: str, findings: Sequence[Finding]) -> str:
-    """Command that accepts what is worse."""
-    options = _options(suite, [finding for finding in findings if finding.alarms])
-    return f'if it is intended: estima check{options} --accept "REASON"'
+    return shlex.join(
+        [
+            *["estima", *["--trust"] * is_trusting(), "check"],
+            *([] if is_main(suite) else ["--suite", suite]),
+            *(["--candidate", str(candidate)] if candidate else []),
+            *config_dir_option(config_dir),
+            *(word for name in names for word in ("--only", name)),
+        ]
+    )
 
 
 def _where_to_look(whole: Suite, findings: Sequence[Finding]) -> str:

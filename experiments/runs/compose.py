@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import os
 import re
 import sys
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -174,7 +173,7 @@ class Composer:
         InputError
             If it does, and the user has not said that it is trusted.
         """
-        if self._source is None or os.environ.get(paths.TRUST) == "1":
+        if self._source is None or paths.is_trusting():
             return
         strange = named_code(tree) - _targets_of_conf() - self._own
         require(

@@ -11,6 +11,11 @@ TRUST = "ESTIMA_TRUST"  # set by --trust: data may name code
 SOURCE = Path(__file__).resolve().parents[2]  # the clone, or the site-packages of a wheel
 
 
+def is_trusting() -> bool:
+    """Whether the user has said that data may name code."""
+    return os.environ.get(TRUST) == "1"
+
+
 def packaged(name: str) -> Path:
     """Return a folder that travels with the code: `conf`, or `results/baselines`.
 

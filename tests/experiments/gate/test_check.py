@@ -350,3 +350,14 @@ def test_a_worsening_names_its_worst_recordings_and_how_to_see_them(small, monke
     picture = results() / "runs" / "check" / f"odometry_{first_seed + 1}.png"
     assert picture.exists()
     assert f"estimator=odometry seed={first_seed + 1} world_seed={first_seed + 1}" in shown
+
+
+def test_the_command_that_accepts_has_the_options_of_the_check(monkeypatch, tmp_path):
+    monkeypatch.setenv("ESTIMA_TRUST", "1")
+    said = regress_report.command_again("my suite.yaml", [], tmp_path / "out", tmp_path / "mine")
+    assert said == (
+        f"estima --trust check --suite 'my suite.yaml' --candidate {tmp_path}/out "
+        f"--config-dir {tmp_path}/mine"
+    )
+    monkeypatch.delenv("ESTIMA_TRUST")
+    assert regress_report.command_again("check", [], None, None) == "estima check"
