@@ -12,9 +12,10 @@ import numpy as np
 import pandas as pd
 
 from experiments.gate.candidate import candidate_rows
-from experiments.gate.compare import WHICH, Finding, compare, failed_runs, how
+from experiments.gate.compare import WHICH, Finding, compare, failed_runs, how, how_to_renew
 from experiments.gate.suite import ERRORS, Suite, read_suite, run_suite, suite_path
 from experiments.runs.paths import packaged, results
+from experiments.runs.row import Outcome
 from experiments.runs.version import code_version
 from sim.errors import InputError, require
 from sim.files import write_text
@@ -97,9 +98,17 @@ def _damage(text: str, rows: pd.DataFrame) -> str:
             numbers = pd.to_numeric(cells, errors="coerce")
             if len(wrong := cells[numbers.isna() & cells.notna()]):
                 return f"{name} {wrong.iloc[0]!r} is not a number"
+            if name in ERRORS and (numbers < 0.0).any():
+                return f"{name} {numbers.min():g} is below zero"
             cells = numbers.replace([np.inf, -np.inf], np.nan)
         if name not in ERRORS and cells.isna().any():
             return f"a row without {name}"
+    if not rows["status"].isin([*Outcome]).all():
+        return f"status {rows['status'][~rows['status'].isin([*Outcome])].iloc[0]!r} is unknown"
+    sound = rows["status"] != Outcome.FAILED
+    for name in ERRORS:
+        if rows.loc[sound, name].isna().any():
+            return f"a row that did not fail without {name}"
     twice = rows[rows.duplicated(list(WHICH))]
     if len(twice):
         return "two rows of {}, recording {}, repeat {}".format(*twice.iloc[0][list(WHICH)])
@@ -185,6 +194,10 @@ def check(
         for key, path in baseline_paths(suite_name).items()
         if key == "accepted" or path.exists()
     }
+    for key, rows in baselines.items():
+        absent = [e.name for e in suite.estimators if e.name not in set(rows["estimator"])]
+        words = f"the {key} baseline has no {', '.join(absent)}; {how_to_renew(key)}"
+        require(not absent, words)
     return compare(baselines, _rows(suite, 1, candidate, on_progress))
 
 

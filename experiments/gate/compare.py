@@ -297,6 +297,12 @@ def by_repeat(rows: pd.DataFrame, error: str) -> Array:
     return np.asarray(rows.pivot(index="recording", columns="repeat", values=error), np.float64)
 
 
+def how_to_renew(name: str) -> str:
+    """Say how a baseline is started anew."""
+    also = " and pin the release with it" if name == "release" else ""
+    return f"accept a check with a reason{also} to start a new baseline"
+
+
 def check_recordings(estimator: str, name: str, then: pd.DataFrame, now: pd.DataFrame) -> None:
     """Refuse rows that cannot be compared with a baseline's, run by run.
 
@@ -305,14 +311,14 @@ def check_recordings(estimator: str, name: str, then: pd.DataFrame, now: pd.Data
     InputError
         If the baseline has no such estimator, or it ran over other recordings.
     """
-    remedy = "; accept a check with a reason to start a new baseline"
-    require(not then.empty, f"the {name} baseline has no {estimator}{remedy}")
+    remedy = how_to_renew(name)
+    require(not then.empty, f"the {name} baseline has no {estimator}; {remedy}")
     before, after = (
         rows.drop_duplicates("recording").set_index("recording") for rows in (then, now)
     )
     require(
         set(before.index) == set(after.index),
-        f"the {name} baseline of {estimator} has other recordings{remedy}",
+        f"the {name} baseline of {estimator} has other recordings; {remedy}",
     )
     after = after.loc[before.index]
     away = np.abs(after["fingerprint"] - before["fingerprint"])
@@ -321,7 +327,7 @@ def check_recordings(estimator: str, name: str, then: pd.DataFrame, now: pd.Data
     require(
         not other.any(),
         f"recording {other.idxmax()} of {estimator} is not that of the {name} baseline: what "
-        f"simulates it has changed, and errors cannot be compared run by run{remedy}",
+        f"simulates it has changed, and errors cannot be compared run by run; {remedy}",
     )
 
 

@@ -242,6 +242,9 @@ def test_a_damaged_baseline_is_called_damaged(tmp_path):
         (text.replace("fingerprint", "finger"), "no column fingerprint"),
         ("", "No columns"),
         (text.replace("0.25", '"', 1), "EOF"),
+        (text.replace("0.25", "-1", 1), "ate_rmse_m -1 is below zero"),
+        (text.replace("0.25", "", 1), "a row that did not fail without ate_rmse_m"),
+        (text.replace(",ok", ",banana", 1), "status 'banana' is unknown"),
     ):
         path.write_text(damaged)
         with pytest.raises(InputError, match=f"damaged.*{why}.*git checkout -- ") as refusal:
@@ -258,6 +261,21 @@ def test_baselines_are_read_before_the_suite_runs(small, monkeypatch):
     with pytest.raises(InputError, match="damaged"):
         baseline.accept(str(small), "reason")
     with pytest.raises(InputError, match="damaged"):
+        baseline.check(str(small))
+
+
+def test_an_estimator_without_a_baseline_is_named_before_the_suite_runs(small, monkeypatch):
+    monkeypatch.setattr(baseline, "run_suite", no_run)
+    others = baseline.Baseline(table("e", np.full((4, 2), 0.25)), ("why",))
+    names = ", ".join(e.name for e in read_suite(small).estimators)
+    for path in baseline.baseline_paths(str(small)).values():
+        baseline.write_baseline(others, path)
+    with pytest.raises(InputError, match=f"the accepted baseline has no {names}; accept a check"):
+        baseline.check(str(small))
+    accepted = baseline.baseline_paths(str(small))["accepted"]
+    mine = [table(e.name, np.full((4, 2), 0.25)) for e in read_suite(small).estimators]
+    baseline.write_baseline(baseline.Baseline(pd.concat(mine), ("why",)), accepted)
+    with pytest.raises(InputError, match=r"the release baseline has no .* and pin the release"):
         baseline.check(str(small))
 
 
