@@ -22,5 +22,7 @@ def draw_alarms(table: pd.DataFrame) -> Figure:
         axes.step(part["false_per_h"], part["missed"], where="post", color=colour, label=label)
     axes.axvline(1.0, color="#999999", lw=0.8, ls=":")
     axes.set_xscale("symlog", linthresh=1.0)
+    axes.set_xlim(0.0, 1.1 * known["false_per_h"].max())
+    axes.set_xticks([0.0, 1.0, 10.0, 100.0], ["0", "1", "10", "100"])
     axes.set(xlabel="false alarms an hour", ylabel="share of losses missed", ylim=(-0.02, 1.02))
     return with_legend(page, ncols=2)
