@@ -298,7 +298,7 @@ def by_repeat(rows: pd.DataFrame, error: str) -> Array:
 
 
 def how_to_renew(name: str) -> str:
-    """Say how a baseline is started anew."""
+    """Say how a new baseline is started."""
     also = " and pin the release with it" if name == "release" else ""
     return f"accept a check with a reason{also} to start a new baseline"
 
