@@ -124,7 +124,7 @@ def as_words(value: Any) -> str:
     """A setting's value for a sentence."""
     if isinstance(value, bool):
         return "yes" if value else "no"
-    return f"{value:.3g}" if isinstance(value, float) else str(value)
+    return f"{value:.3g}".replace("e-0", "e-") if isinstance(value, float) else str(value)
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ surface through their means predicts them everywhere, and is bootstrapped over w
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -33,6 +33,7 @@ NOWHERE, EVERYWHERE, NONE_ALONE = (
     "everywhere in the region",
     "no single setting",
 )
+_LOCATED = 0.5  # of a setting's range, in which a boundary's interval must lie to be named
 _N_SHARE, _N_OTHERS, _N_LEVELS, _N_LINE = 1024, 64, 16, 201
 
 
@@ -76,6 +77,11 @@ class Fitted:
     means: tuple[Array, ...]
     columns: tuple[slice, ...]
 
+    @property
+    def n_points(self) -> int:
+        """How many points were sampled."""
+        return int(self.means[0].shape[1])
+
     def logs(self, headline: int, units: Array) -> Array:
         """Log ratio (1 + B, N) of a headline at places (N, D)."""
         weights = self.surfaces[headline].weights(units[:, self.columns[headline]])
@@ -101,6 +107,11 @@ class Region:
         The setting that decides, and where the claim begins or ceases to hold along it, in words.
     called
         The setting's name in sentences; empty: as it is.
+    along
+        The setting that matters most, and in how much of the region the claim holds along it, in
+        words; empty where it holds everywhere or nowhere.
+    failing
+        The headline that fails first in most of the rest, in words; empty if there is only one.
     """
 
     anchor: Anchor | None
@@ -108,32 +119,43 @@ class Region:
     decided_by: str
     boundary: str
     called: str = ""
+    along: str = ""
+    failing: str = ""
 
-    def words(self, at_anchor: Verdict) -> str:
-        """Say in how much of the region the claim holds, what decides, and where the paper lies."""
-        ends = [f"{100.0 * v:.0f}" for v in (self.share.value, self.share.low, self.share.high)]
-        called = self.called or self.decided_by
-        said = f"It holds in {ends[0]} % [{ends[1]}, {ends[2]}] of the region of free settings"
-        if self.boundary in (NOWHERE, EVERYWHERE):
-            pass
-        elif self.decided_by == NONE_ALONE:
-            said += ", and no single setting decides"
-        else:
-            said += f"; {called} decides: it {self.boundary}"
-        said += "".join(
-            f". The interval spans {100 * limit:.0f} %, so the region leaves it open"
-            for limit in limits_spanned(self.share)
-        )
-        if self.anchor is None:
-            return f"{said}."
-        printed = "where the printed level comes out"
-        if not math.isfinite(self.anchor.level):
-            printed = "the middle of the ranges, as no level is printed"
-        if at := self.anchor.of(self.decided_by):
-            printed += f" ({called}: {at})"
-        lies = {Verdict.REPRODUCED: "it holds", Verdict.NOT_REPRODUCED: "it does not hold"}
-        there = lies.get(at_anchor, "it is undecided")
-        return f"{said}. At the anchor, {printed}, {there}."
+    def words(self, at_anchor: Verdict, level: str = "") -> str:
+        """Say in how much of the region the claim holds, what decides, and what the anchor says.
+
+        Parameters
+        ----------
+        level
+            The printed level that the anchor has, in words.
+        """
+        value, low, high = (_percent(v) for v in vars(self.share).values())
+        said = [f"It holds in {value} % [{low}, {high}] of the region of free settings."]
+        is_one = self.decided_by != NONE_ALONE
+        if self.along:
+            said += [f"{'' if is_one else 'No single setting decides; '}{self.along}."]
+        if is_one:
+            said += [f"With the others in the middle, it {self.boundary}."]
+        if self.failing:
+            said += [f"Where it does not hold, {self.failing}."]
+        said += [
+            f"The interval contains {100 * limit:.0f} %, {what}, so the claim is undecided."
+            for limit, what in (
+                (LEAST, "the limit below which a claim counts as failing in the region"),
+                (MOST, "the limit above which it counts as holding in the region"),
+            )
+            if limit in limits_spanned(self.share)
+        ]
+        if self.anchor is not None:
+            where = "in the middle of the ranges, since the paper prints no level to match"
+            if math.isfinite(self.anchor.level):
+                where = f"where {level or 'our runs have the printed level'}"
+            if at := self.anchor.of(self.decided_by):
+                where += f", with {self.called or self.decided_by} = {at}"
+            lies = {Verdict.REPRODUCED: "it holds", Verdict.NOT_REPRODUCED: "it does not hold"}
+            said += [f"At the anchor, {where}, {lies.get(at_anchor, 'it is undecided')}."]
+        return " ".join(each[:1].upper() + each[1:] for each in said)
 
 
 def fit(
@@ -178,9 +200,16 @@ def fit(
 
 
 def share(fitted: Fitted) -> Interval:
-    """Share of the region in which the claim holds by the smallest effect of interest."""
-    units = units_of(fitted.settings, sample(fitted.settings, _N_SHARE, rng=None))
-    return _interval((fitted.margins(units) > 0.0).mean(axis=1))
+    """Share of the region in which the claim holds by the smallest effect of interest.
+
+    Of one that holds at all places, or at none, the interval reaches as far as the exact one of
+    95 % for the points sampled, on the one side that is left.
+    """
+    found = _interval((fitted.margins(_even(fitted.settings)) > 0.0).mean(axis=1))
+    beyond = 1.0 - 0.05 ** (1.0 / fitted.n_points)
+    if found.value == 0.0:
+        return replace(found, high=max(found.high, beyond))
+    return replace(found, low=min(found.low, 1.0 - beyond)) if found.value == 1.0 else found
 
 
 def first_order(fitted: Fitted) -> Array:
@@ -234,6 +263,8 @@ def boundary_in_words(fitted: Fitted, i: int) -> str:
         line[:, i] = setting.units(setting.choices)
         good = fitted.margins(snap(fitted.settings, line))[0] > 0.0
         named = [as_words(c) for c, holds in zip(setting.choices, good, strict=True) if holds]
+        if good.all():
+            return EVERYWHERE
         return f"holds where it is {' or '.join(named)}" if named else NOWHERE
     if stretch is None:
         return NOWHERE
@@ -241,7 +272,8 @@ def boundary_in_words(fitted: Fitted, i: int) -> str:
 
     def words(end: Interval) -> str:
         value, least, most = (f"{v:.3g}" for v in setting.at([end.value, end.low, end.high]))
-        return f"{value} [{least}, {most}]"
+        is_located = end.high - end.low < _LOCATED
+        return f"{value} [{least}, {most}]" if is_located else f"{value} (not located)"
 
     parts = [f"above {words(low)}"] * (low.value > 0.0) + [f"below {words(high)}"] * (
         high.value < 1.0
@@ -249,16 +281,53 @@ def boundary_in_words(fitted: Fitted, i: int) -> str:
     return f"holds {' and '.join(parts)}" if parts else EVERYWHERE
 
 
-def describe(fitted: Fitted, anchor: Anchor | None) -> Region:
-    """What a fitted region says of its claim."""
-    found, first = share(fitted), deciding(first_order(fitted))
+def along_in_words(fitted: Fitted, i: int) -> str:
+    """In how much of the region the claim holds along setting `i`, all others varied."""
+    setting, units = fitted.settings[i], _even(fitted.settings)
+    good, u = fitted.margins(units)[0] > 0.0, units[:, i]
+    if setting.choices:
+        parts = [
+            f"{_percent(good[u == at].mean())} % where it is {as_words(choice)}"
+            for choice, at in zip(setting.choices, setting.units(setting.choices), strict=True)
+        ]
+    else:
+        low, high = (as_words(v) for v in setting.at([0.25, 0.75]))
+        parts = [
+            f"{_percent(good[u < 0.25].mean())} % where it is below {low}",
+            f"{_percent(good[(u >= 0.25) & (u < 0.75)].mean())} % from there to {high}",
+            f"{_percent(good[u >= 0.75].mean())} % above",
+        ]
+    return f"{setting.called} matters most: the claim holds in {_listed(parts)}"
+
+
+def failing_in_words(fitted: Fitted, headlines: Sequence[str]) -> str:
+    """The ratio that fails first in most of the region where the claim does not hold."""
+    units = _even(fitted.settings)
+    each = np.stack([s.margin(fitted.logs(k, units)[0]) for k, s in enumerate(fitted.sides)])
+    failing = each[:, each.min(axis=0) <= 0.0]
+    if len(headlines) < 2 or not failing.size:
+        return ""
+    count = np.bincount(failing.argmin(axis=0), minlength=len(headlines))
+    most = int(count.argmax())
+    part = count[most] / count.sum()
+    mostly = "" if part == 1.0 else f", in {_percent(part)} % of it"
+    return f'the ratio "{headlines[most]}" fails first{mostly}'
+
+
+def describe(fitted: Fitted, anchor: Anchor | None, headlines: Sequence[str] = ()) -> Region:
+    """What a fitted region says of its claim, whose headlines are named in words."""
+    indices = first_order(fitted)
+    found, first, most = share(fitted), deciding(indices), int(indices[0].argmax())
+    fails = failing_in_words(fitted, headlines)
     if found.value in (0.0, 1.0):
         at = NOWHERE if found.value == 0.0 else EVERYWHERE
-        return Region(anchor, found, NONE_ALONE, at)
-    if first is None:
-        return Region(anchor, found, NONE_ALONE, "")
+        return Region(anchor, found, NONE_ALONE, at, failing=fails)
+    along = along_in_words(fitted, most)
+    boundary = "" if first is None else boundary_in_words(fitted, first)
+    if first is None or boundary in (NOWHERE, EVERYWHERE):
+        return Region(anchor, found, NONE_ALONE, boundary, along=along, failing=fails)
     own = fitted.settings[first]
-    return Region(anchor, found, own.name, boundary_in_words(fitted, first), own.called)
+    return Region(anchor, found, own.name, boundary, own.called, along, fails)
 
 
 def limits_spanned(share: Interval) -> list[float]:
@@ -300,6 +369,22 @@ def region_columns(region: Region | None, at_anchor: Verdict) -> Mapping[str, An
         "decided_by": region.decided_by,
         "boundary": region.boundary,
     }
+
+
+def _even(settings: Sequence[Setting]) -> Array:
+    """Places spread evenly over the region."""
+    return units_of(settings, sample(settings, _N_SHARE, rng=None))
+
+
+def _percent(share: float) -> str:
+    """A share in percent, near 0 and 1 with another digit."""
+    is_near = 0.0 < share < 0.0495 or 0.9505 < share < 1.0
+    return f"{100.0 * share:.1f}" if is_near else f"{100.0 * share:.0f}"
+
+
+def _listed(parts: Sequence[str]) -> str:
+    """Parts as an enumeration."""
+    return " and ".join([", ".join(parts[:-1]), parts[-1]])
 
 
 def _interval(values: Array) -> Interval:

@@ -189,7 +189,7 @@ def set_apart(
 def judged_regions(results: Results, headlines: Headlines) -> dict[str, Region]:
     """What each claim's region says of it, as far as the runs are there."""
     return {
-        claim: describe(fitted, free.anchor)
+        claim: describe(fitted, free.anchor, [each.words for each in headlines[claim]])
         for claim, free, _, fitted in fitted_regions(results, headlines)
     }
 

@@ -59,7 +59,7 @@ def conclude(
     Parameters
     ----------
     findings
-        `sentences`, a template by the claim's id.
+        `sentences`, a template by the claim's id; `anchor`, the printed level, in words.
     regions
         By the claim's id.
     """
@@ -76,7 +76,8 @@ def conclude(
         said, region = sentence(findings["sentences"][key], rows), regions.get(key)
         said = " ".join([said, *own])
         if region:
-            verdict, said = rule(at_anchor, region.share), f"{said} {region.words(at_anchor)}"
+            rests_on = region.words(at_anchor, findings.get("anchor", ""))
+            verdict, said = rule(at_anchor, region.share), f"{said} {rests_on}"
         if verdict is Verdict.UNDECIDED:
             said += power_stated(rows)
         conclusions.append(Conclusion(key, verdict, said, region, at_anchor))

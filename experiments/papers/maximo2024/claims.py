@@ -88,7 +88,9 @@ HEADLINES: Headlines = {
     "MX3": [
         headline
         for method in ("m2", "m3")
-        for headline in _both(f"{method}_dispersion_m", "m1_dispersion_m", f"{method} / m1", 1.0)
+        for headline in _both(
+            f"{method}_dispersion_m", "m1_dispersion_m", f"{method.upper()} / M1, dispersion", 1.0
+        )
     ],
     "MX4": _both("most_start_m", "least_start_m", "worst over best start", _EQUAL, 1.0 / _EQUAL),
     "MX9": _both("m2_m", "nearest_m", "M2 / nearest node", _NEAREST, 1.0 / _NEAREST),
@@ -108,7 +110,7 @@ def judge(results: Results) -> list[Claim]:
             "MX6": (mx6, {"campus_starts": ()}),
             "MX7": (mx7, {"campus_starts": ()}),
             "MX8": (mx8, {"kidnapping": ()}),
-            "MX9": (mx9, {"weighting": ()}),
+            "MX9": (mx9, {"weighting": (), "region_MX1": ("oxford_m2_m",)}),
         }),
         *([] if runs is None else oxford_runs(runs)),
     ]  # fmt: skip
@@ -180,8 +182,17 @@ def oxford_runs(runs: pd.DataFrame) -> Iterator[Claim]:
         yield shown(Subject("MX1", "runs", method=method), label, found)
 
 
-def mx9(weighting: pd.DataFrame) -> Iterator[Claim]:
-    """MX9: M2 errs as the distance to the nearest node; judged by its region alone."""
+def mx9(weighting: pd.DataFrame, region: pd.DataFrame) -> Iterator[Claim]:
+    """MX9: M2 errs as the distance to the nearest node; judged by its region alone.
+
+    Beside stands the ratio at the anchor, which was found by M2's error.
+    """
+    for headline in HEADLINES["MX9"]:
+        logs = headline.logs(region)
+        low, middle, high = np.exp(np.quantile(logs[np.isfinite(logs)], [0.025, 0.5, 0.975]))
+        about = Subject("MX9", "error", over="nearest node", place=headline.place, arm="region")
+        label = f"{headline.words}, median over the region and 95 % of its points"
+        yield shown(about, label, Interval(float(middle), float(low), float(high)))
     own = weighting[weighting["method"] == "M2"]
     for name in geometries(own):
         part = own[own["geometry"] == name].groupby("seed")[["error_m", "nearest_node_m"]].mean()

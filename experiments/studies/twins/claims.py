@@ -44,7 +44,8 @@ def tw1(pairs: pd.DataFrame, others: pd.DataFrame, minutes: pd.DataFrame) -> Ite
     covered = mean_interval(kept.groupby("log").inside.mean())
     about, label = Subject("TW1", "covered"), "share of errors over a minute in intervals of 95 %"
     claim = judge_bounds(about, label, covered, at_least=COVERED)
-    yield with_remark(claim, f"{len(kept)} minutes and methods of {kept.log.nunique()} logs")
+    names = list(kept["log"].unique())
+    yield with_remark(claim, f"{len(kept)} minutes and methods of {len(names)} logs", logs=names)
     logs = np.log(kept.groupby("log")[[c for c in kept if c.startswith("crps_")]].mean())
     for over, words, is_judged in (
         ("climatology", "the errors on other logs", True),

@@ -190,8 +190,9 @@ def test_the_boundary_is_said_in_the_settings_own_numbers():
     assert region.decided_by == "robot.kr"
     assert region.boundary.startswith("holds below 0.0001 [")
     said = region.words(FAILS)
-    assert "robot.kr decides: it holds below 0.0001 [" in said
-    assert said.endswith("as no level is printed (robot.kr: 0.0001), it does not hold.")
+    assert "Robot.kr matters most: the claim holds in" in said
+    assert "With the others in the middle, it holds below 0.0001 [" in said
+    assert said.endswith("to match, with robot.kr = 0.0001, it does not hold.")
     chosen = planted(lambda u: u[:, 1] - 0.5 - NEED, 8, 0.1, settings=settings)[0]
     assert boundary_in_words(chosen, 1) == "holds where it is measured"
     assert as_words(True) == "yes"
@@ -204,12 +205,13 @@ def test_the_boundary_is_said_in_the_settings_own_numbers():
 
 def test_a_verdict_by_region_is_written_and_read(tmp_path):
     found = judge_bounds(Subject("X1", "ratio"), "a ratio", Interval(0.8, 0.7, 0.9), at_most=1.0)
-    region = Region(Anchor({"k": 0.5}, 9.6), MIDDLE, "k", "holds below 0.7 [0.6, 0.8]")
-    said = {"sentences": {"X1": "It is {{ rows[0].found|plain }}."}}
+    at, boundary = Anchor({"k": 0.5}, 9.6), "holds below 0.7 [0.6, 0.8]"
+    region = Region(at, MIDDLE, "k", boundary, along="k matters most")
+    said = {"sentences": {"X1": "It is {{ rows[0].found|plain }}."}, "anchor": "M2 errs 9.6 m"}
     (ruled,) = conclude([found], said, {"X1": region})
     assert (ruled.verdict, ruled.at_anchor) == (Verdict.DEPENDS, HOLDS)
-    assert "k decides: it holds below 0.7" in ruled.sentence
-    assert "where the printed level comes out (k: 0.5), it holds." in ruled.sentence
+    assert "K matters most. With the others in the middle, it holds below 0.7" in ruled.sentence
+    assert "At the anchor, where M2 errs 9.6 m, with k = 0.5, it holds." in ruled.sentence
     (alone,) = conclude([dataclasses.replace(found, role=Role.BESIDE)], said, {"X1": region})
     assert (alone.verdict, alone.at_anchor) == (Verdict.DEPENDS, ALONE)
     path = tmp_path / "verdicts.csv"
