@@ -228,7 +228,7 @@ def reproduce_paper(paper: str, profile: Profile) -> list[Conclusion]:
 
 
 def _count(folder: Path) -> str:
-    return pluralize(sum(1 for _ in folder.glob("*.json")), "job")
+    return pluralize(sum(1 for _ in folder.glob("*.job")), "job")
 
 
 def _drawn_items(made: Results) -> Items:

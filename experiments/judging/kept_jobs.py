@@ -32,7 +32,7 @@ def file_of(folder: Path, function: Callable[..., Any], job: Sequence[Any]) -> P
         text = json.dumps([_named(function), *map(_named, job)])
     except TypeError:
         return None
-    return folder / f"{hashlib.sha256(text.encode()).hexdigest()[:24]}.json"
+    return folder / f"{hashlib.sha256(text.encode()).hexdigest()[:24]}.job"
 
 
 def keep(path: Path, tables: Tables, dependencies: Digests, seconds: float) -> None:

@@ -325,7 +325,8 @@ def describe(fitted: Fitted, anchor: Anchor | None, headlines: Sequence[str] = (
     along = along_in_words(fitted, most)
     boundary = "" if first is None else boundary_in_words(fitted, first)
     if first is None or boundary in (NOWHERE, EVERYWHERE):
-        return Region(anchor, found, NONE_ALONE, boundary, along=along, failing=fails)
+        at = boundary.replace(EVERYWHERE, "")  # along that setting alone
+        return Region(anchor, found, NONE_ALONE, at, along=along, failing=fails)
     own = fitted.settings[first]
     return Region(anchor, found, own.name, boundary, own.called, along, fails)
 

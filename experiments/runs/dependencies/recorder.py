@@ -29,7 +29,7 @@ from experiments.runs.paths import SOURCE
 Digests = Mapping[str, str]  # of each dependency, by its name
 _HOUSE = ("sim", "estimators", "experiments", "estima")
 _BUILT = (".py", ".pyc", ".so", ".nbi", ".nbc", ".pth")  # modules, and their caches
-_OURS = (".lock", ".journal")
+_OURS = (".lock", ".journal", ".job")
 _SYSTEM = ("/proc/", "/sys/", "/dev/", "/etc/", "/usr/", "/lib", str(Path.home() / ".cache"))
 _WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT
 

@@ -131,6 +131,5 @@ def test_the_anchor_is_refined_by_what_is_measured_there():
 
 def test_without_a_printed_level_the_anchor_is_the_middle():
     assert middle(SETTINGS).words == (
-        "robot.kr = 3.16e-5, estimator.n_nearest = 11, estimator.noise_at = b, "
-        "laser.sigma_m = 0.03"
+        "robot.kr = 3.16e-5, estimator.n_nearest = 11, estimator.noise_at = b, laser.sigma_m = 0.03"
     )

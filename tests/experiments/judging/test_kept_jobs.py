@@ -43,7 +43,7 @@ def as_csv(tables):
 def test_finished_jobs_are_not_run_again(tmp_path):
     (ran := tmp_path / "ran").mkdir()
     whole = as_csv(judge(tmp_path / "kept", ran))
-    first = next((tmp_path / "kept").glob("*.json"))
+    first = next((tmp_path / "kept").glob("*.job"))
     first.unlink()
     assert as_csv(judge(tmp_path / "kept", ran)) == whole
     assert sorted(times_run(ran).values()) == [1, 1, 1, 2]
@@ -52,7 +52,7 @@ def test_finished_jobs_are_not_run_again(tmp_path):
 def test_a_damaged_file_counts_as_none(tmp_path):
     (ran := tmp_path / "ran").mkdir()
     whole = as_csv(judge(tmp_path / "kept", ran))
-    for path in (tmp_path / "kept").glob("*.json"):
+    for path in (tmp_path / "kept").glob("*.job"):
         path.write_text(path.read_text()[:-20])
     assert as_csv(judge(tmp_path / "kept", ran)) == whole
     assert set(times_run(ran).values()) == {2}
@@ -89,13 +89,13 @@ def test_what_has_no_lasting_name_is_not_kept(value, tmp_path):
 
 
 def test_tables_that_json_cannot_hold_are_not_kept(tmp_path):
-    path = tmp_path / "a.json"
+    path = tmp_path / "a.job"
     keep(path, {"rows": [{"a": np.zeros(2)}]}, {}, 1.0)
     assert not path.exists()
 
 
 def test_numbers_to_the_digit(tmp_path):
-    path = tmp_path / "a.json"
+    path = tmp_path / "a.job"
     values = [0.1 + 0.2, np.pi * 1e-300, np.nan, np.inf, None, True, "a"]
     keep(path, {"rows": [{"v": v} for v in values]}, {}, 1.0)
     found = [row["v"] for row in kept(path)[0]["rows"]]

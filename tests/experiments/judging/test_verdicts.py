@@ -216,7 +216,7 @@ def test_every_claim_has_one_verdict_and_a_plain_sentence(tracked):
         assert "nan" not in each.sentence
         assert not re.search(r"unknown times|unknown share|\de\+\d", each.sentence)
         if each.verdict is Verdict.UNDECIDED:
-            why = r"with a power of 0\.\d\d\.|interval spans [28]0 %, so the region leaves it open"
+            why = r"with a power of 0\.\d\d\.|interval contains [28]0 %, the limit"
             assert re.search(why, each.sentence)
 
 

@@ -62,7 +62,7 @@ def test_dc1_does_not_rank_icp_and_odometry():
     assert verdicts(found)["position RMSE, icp over odometry"] == "not_reproduced"
     said = ruled(found)
     assert said.verdict == "reproduced"
-    assert "one drive, shows it in 1" in said.sentence or "shows it in 20 of 20" in said.sentence
+    assert "one drive: 1" in said.sentence or "one drive: 20 of 20" in said.sentence
 
 
 def test_dc1_tells_what_the_start_from_the_wheels_adds():

@@ -52,8 +52,8 @@ def test_mx1_follows_the_errors():
     found = concluded("maximo2024", said)
     assert found.verdict == "reproduced"
     assert found.sentence.startswith("With made descriptors")
-    assert "M3 has 21 [" in found.sentence
-    assert "shows it in 24 of 24 cases" in found.sentence
+    assert "reproduced (M3 over M2: 21 [" in found.sentence
+    assert "ten runs: 24 of 24 such trials show" in found.sentence
     for umh, at in (({"m1": 0.3}, 2), ({"m3": 0.6}, 3)):
         assert headlines(claims.mx1(both_routes(**umh)))[at] == "not_reproduced"
     oxford = pd.concat([weighting(9.0, 9.61, 20.0), weighting(0.8, 0.4, 0.44, "umh")])
@@ -81,9 +81,13 @@ def test_all_oxford_runs_stand_beside():
 
 def test_mx9_is_judged_by_its_region_alone():
     table = both_routes().assign(nearest_node_m=10.09)
-    said = list(claims.mx9(table))
+    columns = {"oxford_m2_m": [2.0, 4.0], "umh_m2_m": [1.0, 1.0], "oxford_nearest_m": 2.0}
+    region, *_, anchor, _ = said = list(
+        claims.mx9(table, pd.DataFrame({**columns, "umh_nearest_m": 2.0}))
+    )
     assert headlines(said) == []
-    assert said[0].found.value == pytest.approx(9.61 / 10.09, rel=0.2)
+    assert region.found.value == pytest.approx(2.0**0.5)
+    assert anchor.found.value == pytest.approx(9.61 / 10.09, rel=0.2)
     assert free_settings("maximo2024")["MX9"].anchor is None
 
 

@@ -280,7 +280,7 @@ def test_a_damaged_figure_is_named(tmp_path, results):
 def test_findings_are_complete(paper):
     about = contents.findings(paper)
     kept = {"title", "source", "doi", "about", "claims", "own", "sentences", "figures"}
-    assert set(about) - {"criteria"} == kept
+    assert set(about) - {"criteria", "anchor"} == kept
     assert bool(about["source"]) == (paper in contents.PAPERS)
     assert set(about["own"]) <= set(about["claims"])
     for name, figure in about["figures"].items():
