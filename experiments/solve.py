@@ -127,10 +127,16 @@ def solve_log(
     begun = time.monotonic()
     recording = read_any(log, robot)
     judged = None if relations is None else read_relations(relations)
-    with hold_interrupts() as interrupt:
-        solved = solve(recording, overrides, interrupt)
-        row = {"log": str(log[0]), **solved.row, **scores_of(solved, judged)}
-        write_folder(solved, row, out, interrupt)
+    try:
+        with hold_interrupts() as interrupt:
+            solved = solve(recording, overrides, interrupt)
+            row = {"log": str(log[0]), **solved.row, **scores_of(solved, judged)}
+            write_folder(solved, row, out, interrupt)
+    except KeyboardInterrupt:
+        left = "is not whole" if out.exists() else "is not written"
+        raise KeyboardInterrupt(
+            f"interrupted; {out} {left}: run it again, from the start"
+        ) from None
     row["wall_time_s"] = round(time.monotonic() - begun, 1)
     write_text(out / "summary.json", json.dumps(row, indent=2) + "\n")
     text = io.StringIO()

@@ -7,6 +7,7 @@ import json
 import numpy as np
 import pytest
 
+from experiments import solve as solving
 from experiments.runs.calibration import read_calibration
 from experiments.solve import solve
 from sim import se2
@@ -83,6 +84,16 @@ def test_truth_is_not_looked_at():
     moved = dataclasses.replace(log.truth, poses=log.truth.poses[::-1].copy())
     paths = [solve(one).path for one in (log, dataclasses.replace(log, truth=moved))]
     np.testing.assert_array_equal(paths[0].means, paths[1].means)
+
+
+def test_an_interrupt_says_that_nothing_is_kept(tmp_path, monkeypatch):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(solving, "solve", interrupted)
+    save(log_of(2.0, sensor="laser"), tmp_path / "log.npz")
+    with pytest.raises(KeyboardInterrupt, match="out is not written: run it again, from the start"):
+        solving.solve_log([tmp_path / "log.npz"], tmp_path / "out")
 
 
 def test_bad_input_is_one_line(tmp_path):
