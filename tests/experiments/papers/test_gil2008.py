@@ -468,8 +468,7 @@ def test_gi7_counts_the_worlds_in_which_one_filter_alone_diverges():
     assert (few.verdict, enough.verdict) == ("undecided", "reproduced")
     assert few.reason.endswith("p = 0.062")
     assert 0.0 < few.power < 1.0
-    both = list(judge.gi7(associated(fastslam=3.5)))[1]
-    assert both.verdict == "undecided"
+    assert list(judge.gi7(associated(fastslam=3.5)))[1].verdict == "undecided"
 
 
 def test_gi8_reads_exponents():
@@ -487,13 +486,11 @@ def test_gi8_reads_exponents():
         for ids in ("known", "unknown")
         for n in (100, 200, 400, 800)
     ]
-    table = pd.DataFrame(rows)
-    assert headlines(judge.gi8(table)) == ["reproduced", "reproduced"]
-    linear = table[table["maps"] == "contiguous"].assign(maps="shared")
-    both = pd.concat([linear, table[table["maps"] == "shared"].assign(maps="contiguous")])
-    assert headlines(judge.gi8(both)) == ["not_reproduced", "not_reproduced"]
-    said = concluded("gil2008", judge.gi8(table))
+    said = concluded("gil2008", judge.gi8(table := pd.DataFrame(rows)))
+    assert said.verdict == "reproduced"
     assert "grows as N^0.10 with maps that particles share until one writes" in said.sentence
+    swapped = table.replace({"maps": {"contiguous": "shared", "shared": "contiguous"}})
+    assert headlines(judge.gi8(swapped)) == ["not_reproduced", "not_reproduced"]
 
 
 def test_interval_of_a_median():

@@ -11,6 +11,7 @@ import sys
 import time
 from pathlib import Path
 
+import joblib
 import numpy as np
 import pandas as pd
 import pytest
@@ -82,6 +83,7 @@ def own_estimator(folder, body):
     return ["run", "-m", "--config-dir", str(folder / "conf"), *SHORT, "estimator=estuary"]
 
 
+@pytest.mark.skipif(joblib.cpu_count() < 2, reason="on one core joblib has no workers")
 @pytest.mark.parametrize(
     ("body", "words"),
     [pytest.param("self.how == 'bad' and sys.exit(0)", "SystemExit", marks=pytest.mark.slow),
