@@ -127,13 +127,14 @@ def solve_log(
     begun = time.monotonic()
     recording = read_any(log, robot)
     judged = None if relations is None else read_relations(relations)
+    left = "is not written"
     try:
         with hold_interrupts() as interrupt:
             solved = solve(recording, overrides, interrupt)
             row = {"log": str(log[0]), **solved.row, **scores_of(solved, judged)}
+            left = "is not whole"
             write_folder(solved, row, out, interrupt)
     except KeyboardInterrupt:
-        left = "is not whole" if out.exists() else "is not written"
         raise KeyboardInterrupt(
             f"interrupted; {out} {left}: run it again, from the start"
         ) from None

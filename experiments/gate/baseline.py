@@ -103,8 +103,8 @@ def _damage(text: str, rows: pd.DataFrame) -> str:
             cells = numbers.replace([np.inf, -np.inf], np.nan)
         if name not in ERRORS and cells.isna().any():
             return f"a row without {name}"
-    if not rows["status"].isin([*Outcome]).all():
-        return f"status {rows['status'][~rows['status'].isin([*Outcome])].iloc[0]!r} is unknown"
+    if len(strange := rows["status"][~rows["status"].isin([*Outcome])]):
+        return f"status {strange.iloc[0]!r} is unknown"
     sound = rows["status"] != Outcome.FAILED
     for name in ERRORS:
         if rows.loc[sound, name].isna().any():

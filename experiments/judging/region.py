@@ -7,6 +7,7 @@ surface through their means predicts them everywhere, and is bootstrapped over w
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,7 @@ from experiments.judging.free_settings import (
     units_of,
 )
 from experiments.judging.surface import Surface, fit_surface
+from experiments.runs.console import enumerate_words
 from sim.arrays import Array
 from sim.errors import require
 
@@ -87,10 +89,19 @@ class Fitted:
         weights = self.surfaces[headline].weights(units[:, self.columns[headline]])
         return np.asarray(self.means[headline] @ weights.T)
 
+    def margins_apart(self, units: Array) -> Array:
+        """Margin (H, 1 + B, N) of each headline at places (N, D)."""
+        return np.stack([side.margin(self.logs(i, units)) for i, side in enumerate(self.sides)])
+
     def margins(self, units: Array) -> Array:
         """Margin (1 + B, N) of the worst headline at places (N, D)."""
-        parts = [side.margin(self.logs(i, units)) for i, side in enumerate(self.sides)]
-        return np.asarray(np.minimum.reduce(parts))
+        return np.asarray(self.margins_apart(units).min(axis=0))
+
+    @cached_property
+    def spread(self) -> tuple[Array, Array]:
+        """Places (N, D) spread evenly over the region, and each headline's margin there."""
+        units = units_of(self.settings, sample(self.settings, _N_SHARE, rng=None))
+        return units, self.margins_apart(units)
 
 
 @dataclass(frozen=True)
@@ -130,7 +141,7 @@ class Region:
         level
             The printed level that the anchor has, in words.
         """
-        value, low, high = (_percent(v) for v in vars(self.share).values())
+        value, low, high = map(_percent, (self.share.value, self.share.low, self.share.high))
         said = [f"It holds in {value} % [{low}, {high}] of the region of free settings."]
         is_one = self.decided_by != NONE_ALONE
         if self.along:
@@ -205,7 +216,8 @@ def share(fitted: Fitted) -> Interval:
     Of one that holds at all places, or at none, the interval reaches as far as the exact one of
     95 % for the points sampled, on the one side that is left.
     """
-    found = _interval((fitted.margins(_even(fitted.settings)) > 0.0).mean(axis=1))
+    _, margins = fitted.spread
+    found = _interval((margins.min(axis=0) > 0.0).mean(axis=1))
     beyond = 1.0 - 0.05 ** (1.0 / fitted.n_points)
     if found.value == 0.0:
         return replace(found, high=max(found.high, beyond))
@@ -271,7 +283,7 @@ def boundary_in_words(fitted: Fitted, i: int) -> str:
     low, high = stretch
 
     def words(end: Interval) -> str:
-        value, least, most = (f"{v:.3g}" for v in setting.at([end.value, end.low, end.high]))
+        value, least, most = map(as_words, setting.at([end.value, end.low, end.high]))
         is_located = end.high - end.low < _LOCATED
         return f"{value} [{least}, {most}]" if is_located else f"{value} (not located)"
 
@@ -283,8 +295,8 @@ def boundary_in_words(fitted: Fitted, i: int) -> str:
 
 def along_in_words(fitted: Fitted, i: int) -> str:
     """In how much of the region the claim holds along setting `i`, all others varied."""
-    setting, units = fitted.settings[i], _even(fitted.settings)
-    good, u = fitted.margins(units)[0] > 0.0, units[:, i]
+    setting, (units, margins) = fitted.settings[i], fitted.spread
+    good, u = margins[:, 0].min(axis=0) > 0.0, units[:, i]
     if setting.choices:
         parts = [
             f"{_percent(good[u == at].mean())} % where it is {as_words(choice)}"
@@ -297,13 +309,12 @@ def along_in_words(fitted: Fitted, i: int) -> str:
             f"{_percent(good[(u >= 0.25) & (u < 0.75)].mean())} % from there to {high}",
             f"{_percent(good[u >= 0.75].mean())} % above",
         ]
-    return f"{setting.called} matters most: the claim holds in {_listed(parts)}"
+    return f"{setting.called} matters most: the claim holds in {enumerate_words(parts)}"
 
 
 def failing_in_words(fitted: Fitted, headlines: Sequence[str]) -> str:
     """The ratio that fails first in most of the region where the claim does not hold."""
-    units = _even(fitted.settings)
-    each = np.stack([s.margin(fitted.logs(k, units)[0]) for k, s in enumerate(fitted.sides)])
+    each = fitted.spread[1][:, 0]
     failing = each[:, each.min(axis=0) <= 0.0]
     if len(headlines) < 2 or not failing.size:
         return ""
@@ -325,7 +336,7 @@ def describe(fitted: Fitted, anchor: Anchor | None, headlines: Sequence[str] = (
     along = along_in_words(fitted, most)
     boundary = "" if first is None else boundary_in_words(fitted, first)
     if first is None or boundary in (NOWHERE, EVERYWHERE):
-        at = boundary.replace(EVERYWHERE, "")  # along that setting alone
+        at = NOWHERE if boundary == NOWHERE else ""
         return Region(anchor, found, NONE_ALONE, at, along=along, failing=fails)
     own = fitted.settings[first]
     return Region(anchor, found, own.name, boundary, own.called, along, fails)
@@ -372,20 +383,10 @@ def region_columns(region: Region | None, at_anchor: Verdict) -> Mapping[str, An
     }
 
 
-def _even(settings: Sequence[Setting]) -> Array:
-    """Places spread evenly over the region."""
-    return units_of(settings, sample(settings, _N_SHARE, rng=None))
-
-
 def _percent(share: float) -> str:
     """A share in percent, near 0 and 1 with another digit."""
     is_near = 0.0 < share < 0.0495 or 0.9505 < share < 1.0
     return f"{100.0 * share:.1f}" if is_near else f"{100.0 * share:.0f}"
-
-
-def _listed(parts: Sequence[str]) -> str:
-    """Parts as an enumeration."""
-    return " and ".join([", ".join(parts[:-1]), parts[-1]])
 
 
 def _interval(values: Array) -> Interval:

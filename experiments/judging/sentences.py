@@ -1,7 +1,8 @@
 """One sentence a claim: a template of the study's findings, filled from the claim's statistics.
 
 A template selects statistics by their fields, `select(quantity="error", size=3)` for the one and
-`select_all(...)` for all with them, and writes their numbers by the filters of this module.
+`select_all(...)` for all with them, and writes their numbers by the filters of this module;
+`headlines` is the verdict of the headlines, in words.
 """
 
 import math
@@ -86,7 +87,12 @@ def conclude(
 
 def sentence(template: str, rows: Sequence[Claim]) -> str:
     """Fill a claim's template with its statistics."""
-    names = {"select": partial(select, rows), "select_all": partial(select_all, rows), "rows": rows}
+    names = {
+        "select": partial(select, rows),
+        "select_all": partial(select_all, rows),
+        "headlines": headline_verdict([(row.role, row.verdict) for row in rows]).label,
+        "rows": rows,
+    }
     return " ".join(_ENVIRONMENT.from_string(template).render(names).split())
 
 

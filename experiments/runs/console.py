@@ -9,7 +9,7 @@ import sys
 import textwrap
 import time
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from typing import Any, NoReturn, TextIO
 
@@ -189,6 +189,11 @@ def _configuration_errors() -> tuple[type[Exception], ...]:
 def pluralize(n: int, what: str) -> str:
     """A number of things, such as 1 run or 2 runs."""
     return f"{n} {what}" if n == 1 else f"{n} {what}s"
+
+
+def enumerate_words(words: Sequence[str]) -> str:
+    """Write words as an enumeration, such as a, b and c."""
+    return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
 
 
 def show(text: str) -> None:

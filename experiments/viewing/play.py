@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from experiments.runs import paths
-from experiments.runs.console import progress
+from experiments.runs.console import enumerate_words, progress
 from experiments.runs.experiment import Experiment
 from experiments.viewing import live, movie
 from experiments.viewing.estimates import OnStep, with_all_estimates
@@ -97,7 +97,10 @@ def play(
     if how.out is None:
         require(len(team) == 1, "a team is drawn in files; name one, such as team.html")
         live.check_display()
-    shown, label = Playback.of(team, how.n_pictures(team.duration_s)), _in_words(names)
+    shown, label = (
+        Playback.of(team, how.n_pictures(team.duration_s)),
+        enumerate_words([Path(name).name for name in names]),
+    )
     if names:
         n_steps = len(names) * sum(len(robot.frame_stamps) for robot in team.robots)
         with progress(label, n_steps) as on_step:
@@ -128,11 +131,6 @@ def play_file(log: Path, sources: Sequence[str], overrides: Sequence[str], how: 
         sources,
         lambda shown, on_step: with_all_estimates(shown, sources, overrides, on_step),
     )
-
-
-def _in_words(names: Sequence[str]) -> str:
-    short = [Path(name).name for name in names]
-    return " and ".join([", ".join(short[:-1]), short[-1]] if len(short) > 1 else short)
 
 
 def draw_world(overrides: Sequence[str], out: Path) -> Path:

@@ -92,7 +92,7 @@ def test_an_interrupt_says_that_nothing_is_kept(tmp_path, monkeypatch):
 
     monkeypatch.setattr(solving, "solve", interrupted)
     save(log_of(2.0, sensor="laser"), tmp_path / "log.npz")
-    with pytest.raises(KeyboardInterrupt, match="out is not written: start it again"):
+    with pytest.raises(KeyboardInterrupt, match="out is not written: run it again, from the start"):
         solving.solve_log([tmp_path / "log.npz"], tmp_path / "out")
 
 
