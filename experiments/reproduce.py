@@ -96,13 +96,15 @@ def _again(place: Path, study: str) -> tuple[int, list[Conclusion], list[Claim]]
     return n_figures, conclusions, claims
 
 
-def reproduce(only: str | None = None) -> None:
+def reproduce(only: str | None = None, part: str | None = None) -> None:
     """Run the studies, judge the claims, draw the figures, write the report.
 
     Parameters
     ----------
     only
         A study's short name, or None for all.
+    part
+        Of that study, as for `reproduce_part`; None for all of it.
     """
     _check_claims()
     lines = []
@@ -111,7 +113,7 @@ def reproduce(only: str | None = None) -> None:
         if paper in LOGS and (why := why_missing()):
             warn(f"{paper}: left out, {why}")
             continue
-        conclusions = reproduce_paper(paper, Profile.FULL)
+        conclusions = reproduce_part(paper, part) if part else reproduce_paper(paper, Profile.FULL)
         for each in conclusions:
             show(f"{each.id:<4} {each.verdict.label:<15} {first_sentence(each.sentence)}")
         counts = Counter(each.verdict for each in conclusions)
@@ -224,6 +226,32 @@ def reproduce_paper(paper: str, profile: Profile) -> list[Conclusion]:
         note_built(place, paper, items | verdicts, only_these=True)
     for left in aside.glob(f"unfinished-{paper}-{profile}-*"):
         shutil.rmtree(left, ignore_errors=True)
+    return conclusions
+
+
+def reproduce_part(study: str, name: str) -> list[Conclusion]:
+    """Make some of a study's tables again, by its PARTS; draw and judge from all that are there.
+
+    The other tables stay as they are, and so does what results/built.json says of them.
+    """
+    module, place = _part(study, "study"), results()
+    if name not in getattr(module, "PARTS", {}):
+        known = ", ".join(getattr(module, "PARTS", {})) or "none"
+        raise InputError(f"{study} has no part {name!r} to be made alone; it has {known}")
+    made = Results(place, study)
+    with progress(f"{study}: {name}", 1.0) as on_progress, recorded(module.__name__) as seen:
+        seen.keep_in = (
+            place / "cache" / f"unfinished-{study}-{name}-{digest_of_all(seen.digests())}"
+        )
+        tables = module.PARTS[name](Profile.FULL, on_progress)
+        made.write_tables(**tables)
+    own = {f"tables/{study}_{table}.csv" for table in tables}
+    items = {key: one for key, one in table_dependencies(seen, place).items() if key in own}
+    items |= _drawn_items(made)
+    verdicts, claims, conclusions = _judged_items(made)
+    _write(claims, conclusions, place, study, Profile.FULL)
+    note_built(place, study, items | verdicts)
+    shutil.rmtree(seen.keep_in, ignore_errors=True)
     return conclusions
 
 

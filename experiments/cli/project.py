@@ -25,6 +25,9 @@ def reproduce(
         bool, typer.Option("--stale", help="Make what is stale again, as `estima results` lists.")
     ] = False,
     paper: Annotated[str | None, typer.Option(help="Make only this paper or study again.")] = None,
+    part: Annotated[
+        str | None, typer.Option(help="With --paper and --full: make only this part of it again.")
+    ] = None,
     figures_only: Annotated[
         bool, typer.Option("--figures-only", help="Redraw the figures from the tables in results/.")
     ] = False,
@@ -40,6 +43,8 @@ def reproduce(
 
       estima reproduce --paper puzzlebot2024
 
+      estima reproduce --paper gil2008 --full --part divergence
+
       estima reproduce --stale
     """
     from experiments import reproduce as made
@@ -47,12 +52,13 @@ def reproduce(
     require(
         full + stale + figures_only <= 1, "--full, --stale and --figures-only: give one of them"
     )
+    require(part is None or (full and paper is not None), "--part: needs --paper and --full")
     if figures_only:
         made.redraw(only=paper)
     elif stale:
         made.renew(only=paper)
     elif full or paper is not None:
-        made.reproduce(only=paper)
+        made.reproduce(only=paper, part=part)
     elif not made.check_results(minutes):
         raise typer.Exit(1)
 

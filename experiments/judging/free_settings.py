@@ -158,6 +158,8 @@ class FreeSettings:
         Printed levels by where they apply, such as a data set.
     is_alone
         Whether the claim is judged by its region alone, as it is about the printed level itself.
+    n_points, n_worlds
+        Points of the region, a power of two, and worlds at each.
     """
 
     settings: tuple[Setting, ...]
@@ -165,6 +167,8 @@ class FreeSettings:
     effect: float = SMALLEST_EFFECT
     printed: Mapping[str, Printed] = field(default_factory=dict)
     is_alone: bool = False
+    n_points: int = 64
+    n_worlds: int = 3
 
     @property
     def anchor(self) -> Anchor | None:
@@ -233,7 +237,8 @@ def free_settings(study: str) -> dict[str, FreeSettings]:
             str(place): _printed(of, settings, f"{where}.printed.{place}")
             for place, of in given.get("printed", {}).items()
         }
-        found[claim] = FreeSettings(settings, claim, effect, printed, is_alone)
+        sizes = {f"n_{name}": int(given[name]) for name in ("points", "worlds") if name in given}
+        found[claim] = FreeSettings(settings, claim, effect, printed, is_alone, **sizes)
     return found
 
 

@@ -20,7 +20,7 @@ from experiments.judging.jobs import Tables
 from experiments.judging.region import Fitted, Region, Side, describe, fit
 from experiments.judging.region_figure import draw_region
 from experiments.judging.remake import Cells, Remake
-from experiments.judging.results import FIRST_SEED, Profile, Results
+from experiments.judging.results import Profile, Results, first_seed
 from experiments.runs.row import Row
 from experiments.runs.seeds import stream
 from sim.arrays import Array
@@ -28,8 +28,7 @@ from sim.errors import require
 
 Run = Callable[[str, Mapping[str, Any], int, Profile], Row]
 Job = tuple[Callable[..., Tables], Run, str, int, Mapping[str, Any], int, Profile]
-N_POINTS = {Profile.FULL: 64, Profile.QUICK: 16}
-N_WORLDS = {Profile.FULL: 3, Profile.QUICK: 2}  # at each point
+N_QUICK = 16, 2  # points of the quick profile, and worlds at each
 _APART = {Profile.FULL: 1000, Profile.QUICK: 0}  # from the seeds of the worlds at the anchor
 _LEAST_POINTS = 8
 
@@ -75,21 +74,27 @@ class Compared:
 Headlines = Mapping[str, Sequence[Compared]]  # by the claim's id
 
 
-def region_jobs(study: str, run: Run, profile: Profile) -> list[Job]:
-    """The calls that make the tables of a study's regions, for `operator.call`."""
-    first = FIRST_SEED[profile] + _APART[profile]
-    return [
-        (_region_row, run, name, point, values, first + N_POINTS[profile] * world + point, profile)
-        for name, free in free_settings(study).items()
-        if free.runs == name
-        for world in range(N_WORLDS[profile])  # further ones leave the seeds of these as they are
-        for point, values in enumerate(_points(study, name, free, profile))
-    ]
+def region_jobs(study: str, run: Run, profile: Profile, only: str | None = None) -> list[Job]:
+    """The calls that make the tables of a study's regions, or only one's, for `operator.call`."""
+    jobs: list[Job] = []
+    for name, free in free_settings(study).items():
+        if free.runs != name or only not in (None, name):
+            continue
+        first = first_seed(study, name, profile) + _APART[profile]
+        n_points, n_worlds = sizes(free, profile)
+        drawn = sample(free.settings, n_points, rng=stream(0, f"region/{study}/{name}"))
+        points = [{str(k): v for k, v in row.items()} for row in drawn.to_dict("records")]
+        jobs += [
+            (_region_row, run, name, point, values, first + n_points * world + point, profile)
+            for world in range(n_worlds)  # further ones leave the seeds of these as they are
+            for point, values in enumerate(points)
+        ]
+    return jobs
 
 
-def _points(study: str, name: str, free: FreeSettings, profile: Profile) -> list[dict[str, Any]]:
-    drawn = sample(free.settings, N_POINTS[profile], rng=stream(0, f"region/{study}/{name}"))
-    return [{str(key): value for key, value in row.items()} for row in drawn.to_dict("records")]
+def sizes(free: FreeSettings, profile: Profile) -> tuple[int, int]:
+    """Points of a claim's region, and worlds at each."""
+    return (free.n_points, free.n_worlds) if profile is Profile.FULL else N_QUICK
 
 
 def _region_row(

@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from experiments.judging import folders
 from experiments.runs.paths import short
 from experiments.runs.row import read_rows, write_frame
 from sim.errors import InputError
@@ -42,6 +43,12 @@ class Profile(StrEnum):
 
 
 FIRST_SEED = {Profile.FULL: 2000, Profile.QUICK: 0}  # of the worlds; those below 100 are for tuning
+
+
+def first_seed(study: str, claim: str, profile: Profile) -> int:
+    """Seed of the first world of a claim's own runs; design.yaml names fresh ones in `seeds`."""
+    fresh = folders.design(study).get("seeds", {}) if profile is Profile.FULL else {}
+    return int(fresh.get(claim, FIRST_SEED[profile]))
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ from experiments.judging.claim import (
     judge_interval,
     power_of,
 )
-from experiments.judging.results import FIRST_SEED, Profile
+from experiments.judging.results import Profile, first_seed
 from sim.errors import InputError, require
 
 T = TypeVar("T")
@@ -179,7 +179,7 @@ def run_worlds(
     given = [each for name, each in designs(study).items() if name in claims]
     looks = sorted({n for each in given for n in each.looks})
     looks = looks if profile is Profile.FULL else [N_QUICK]
-    first, tables, done = FIRST_SEED[profile], dict[str, pd.DataFrame](), 0
+    first, tables, done = first_seed(study, claims[0], profile), dict[str, pd.DataFrame](), 0
 
     def run_to(n: int) -> Mapping[str, pd.DataFrame]:
         nonlocal done

@@ -56,7 +56,7 @@ def draw(results: Results) -> dict[str, Figure]:
         **region_pages(results, HEADLINES),
         "maximo2024_kidnapping": kidnapping(results.table("kidnapping")),
         "maximo2024_campus": campus_errors(
-            results.table("campus_starts"), results.table("clusters")
+            results.table("campus_starts"), results.table("retrieval")
         ),
         **({} if runs is None else {"maximo2024_runs": oxford_runs(runs)}),
     }
@@ -236,7 +236,7 @@ def kidnapping(table: pd.DataFrame) -> Figure:
     return with_legend(page, ncols=3)
 
 
-def campus_errors(starts_table: pd.DataFrame, clusters_table: pd.DataFrame) -> Figure:
+def campus_errors(starts_table: pd.DataFrame, retrieval: pd.DataFrame) -> Figure:
     """Refined errors on simulated clouds, and the retrieval of each descriptor there."""
     page, (left, right) = subplots(9.0, 3.6, 1, 2)
     left.ecdf(starts_table["median_m"].dropna(), color=BLUE, label="median of a start")
@@ -246,8 +246,7 @@ def campus_errors(starts_table: pd.DataFrame, clusters_table: pd.DataFrame) -> F
     left.axvline(spacing, color=WALL, ls="--", label="spacing of the nodes")
     left.set(xlabel="error once localized, m", ylabel="share of starts", xscale="log")
     page.legend(*left.get_legend_handles_labels(), loc="outside lower left", ncols=4, fontsize=8)
-    part = clusters_table[clusters_table["geometry"].str.startswith("campus")]
-    recall = part.groupby("descriptor")[list(_RECALL)].mean().loc[list(describers.KINDS)]
+    recall = retrieval.groupby("descriptor")[list(_RECALL)].mean().loc[list(describers.KINDS)]
     recall = recall.rename(columns=_RECALL, index=_DESCRIPTORS)
     recall.plot.bar(ax=right, color=[BLUE, SKY], width=0.76, rot=0)
     for bars in right.containers:

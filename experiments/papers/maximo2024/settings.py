@@ -22,9 +22,15 @@ CONTROLS = ("oxford_plane", "umh_plane")
 N_WORLDS = {Profile.FULL: 20, Profile.QUICK: 2}  # of each route; of the weightings, by design
 N_RUN_SEEDS = {Profile.FULL: 3, Profile.QUICK: 1}  # worlds of each of the fifteen Oxford runs
 N_CAMPUSES = {Profile.FULL: 20, Profile.QUICK: 1}
-N_CLUSTERED_CAMPUSES = 5
+N_RETRIEVED_CAMPUSES = 5
+# MX5 and MX8, sizes by design.yaml
+CLUSTERED = ("ring_key", "m2dp")  # Scan Context turns with the robot: k-means does not allow for it
+N_CLUSTERED_CAMPUSES = {Profile.FULL: 24, Profile.QUICK: 2}
+N_KIDNAPPED_CAMPUSES = {Profile.FULL: 20, Profile.QUICK: 1}
+N_KIDNAPPED_ROUTES = {Profile.FULL: 60, Profile.QUICK: 2}  # worlds of each route
+N_CAMPUS_KIDNAPPINGS = {Profile.FULL: 15, Profile.QUICK: 5}  # in each campus
 N_CAMPUS_STARTS = {Profile.FULL: 12, Profile.QUICK: 10}  # in each campus
-N_KIDNAPPINGS = {Profile.FULL: 5, Profile.QUICK: 5}  # in each campus
+N_KIDNAPPINGS = 5  # in each world of a route
 N_TIMINGS = {Profile.FULL: 5, Profile.QUICK: 2}
 N_REPEATS = {Profile.FULL: 10, Profile.QUICK: 2}  # in each world
 N_STARTS = {Profile.FULL: 20, Profile.QUICK: 10}

@@ -18,18 +18,20 @@ from experiments.bench import topological
 from experiments.judging.jobs import Progress, Tables, tables_of
 from experiments.judging.region_runs import region_jobs, remake_region
 from experiments.judging.remake import Cells, Remake
-from experiments.judging.results import FIRST_SEED, Arrays, Profile, Results
+from experiments.judging.results import FIRST_SEED, Arrays, Profile, Results, first_seed
 from experiments.judging.sequential import run_worlds
 from experiments.papers.maximo2024.claims import headlines, mx1, mx3, mx7
 from experiments.papers.maximo2024.places import oxford_runs, resequence
 from experiments.papers.maximo2024.settings import (
     CONTROLS,
     DRAWN_DESCRIPTOR,
-    HELD,
     ITERATIONS,
     METHODS,
     N_CLUSTERED_CAMPUSES,
+    N_KIDNAPPED_CAMPUSES,
+    N_KIDNAPPED_ROUTES,
     N_REPEATS,
+    N_RETRIEVED_CAMPUSES,
     N_RUN_SEEDS,
     N_STARTS,
     N_TIMINGS,
@@ -38,7 +40,6 @@ from experiments.papers.maximo2024.settings import (
     PRINTED_1,
     PRINTED_2,
     PRINTED_5,
-    RECOVERED_WITHIN,
     TOLERANCE,
 )
 from experiments.papers.maximo2024.worlds import (
@@ -46,9 +47,10 @@ from experiments.papers.maximo2024.worlds import (
     Rows,
     campus_rows,
     campus_runs,
+    cloud_clusters,
     cluster_labels,
     cluster_row,
-    kidnapping_rows,
+    kidnappings,
     localize,
     make_case,
     options,
@@ -95,6 +97,8 @@ def run(profile: Profile, out: Results, on_progress: Progress) -> None:
         "maximo2024", ["MX7"], profile, partial(_block, "campus", ["campus"], profile),
         lambda made: [mx7(made["campus_starts"])],
     ))  # fmt: skip
+    for part in PARTS.values():
+        tables |= part(profile, lambda _: None)
     first = FIRST_SEED[profile]
     tables["times"] = times(N_TIMINGS[profile], first)
     tables["table_1"] = table_1(tables["weighting"])
@@ -106,6 +110,25 @@ def run(profile: Profile, out: Results, on_progress: Progress) -> None:
         out.write_arrays(name, **arrays)
     out.write_arrays("campus", **campus_arrays(first))
 
+
+def clouds(profile: Profile, on_progress: Progress) -> Mapping[str, pd.DataFrame]:
+    """Clusters of descriptors of clouds, in campuses of their own (MX5)."""
+    first, n = first_seed("maximo2024", "MX5", profile), N_CLUSTERED_CAMPUSES[profile]
+    jobs = [("cloud_clusters", "campus", first + i, profile) for i in range(n)]
+    return tables_of(_labelled, jobs, on_progress)
+
+
+def kidnapped(profile: Profile, on_progress: Progress) -> Mapping[str, pd.DataFrame]:
+    """Kidnappings on the routes and in campuses, in worlds of their own (MX8)."""
+    first, worlds = first_seed("maximo2024", "MX8", profile), N_KIDNAPPED_ROUTES[profile]
+    numbers = dict.fromkeys(routes(), worlds) | {"campus": N_KIDNAPPED_CAMPUSES[profile]}
+    jobs = [
+        ("kidnapping", name, first + i, profile) for name, n in numbers.items() for i in range(n)
+    ]
+    return tables_of(_labelled, jobs, on_progress)
+
+
+PARTS = {"clouds": clouds, "kidnapping": kidnapped}
 
 Job = tuple[str, str, int, Profile]  # what to run, in which world
 
@@ -146,6 +169,7 @@ def _jobs(profile: Profile) -> list[tuple[Job, float]]:
 REMADE = {
     "campus_starts": 30.0,
     "clusters": 2.0,
+    "cloud_clusters": 15.0,
     "dispersion": 4.0,
     "kidnapping": 1.5,
     "particles": 4.0,
@@ -154,6 +178,9 @@ REMADE = {
     "weighting": 4.0,
     "region_MX1": 15.0,
 }  # not means and times
+
+
+_OWN_JOBS = ("cloud_clusters", "kidnapping")
 
 
 def are_here(table: pd.DataFrame) -> NDArray[np.bool_]:
@@ -169,9 +196,9 @@ def remake(table: str, row: Cells) -> Remake:
     if table.startswith("region_"):
         return remake_region("maximo2024", region_run, table, row)
     name = row["geometry"]
-    of_route = dict.fromkeys(("starts", "kidnapping", "clusters", "particles"), "route")
+    of_route = dict.fromkeys(("starts", "clusters", "particles"), "route")
     what = {**of_route, "dispersion": "weighting"}.get(table, table)
-    what = "campus" if name == "campus" else what
+    what = "campus" if name == "campus" and table not in _OWN_JOBS else what
     return _labelled, (what, name, int(row["seed"]), Profile.FULL, table, row.get("method"))
 
 
@@ -201,9 +228,13 @@ def _rows(
 ) -> dict[str, Rows]:
     """All rows of a job, by table."""
     n_repeats = N_REPEATS[profile]
+    if what == "cloud_clusters":
+        return {what: list(cloud_clusters(seed))}
+    if what == "kidnapping":
+        return {what: list(kidnappings(name, seed, profile))}
     if what == "campus":
-        is_early = seed < FIRST_SEED[profile] + N_CLUSTERED_CAMPUSES
-        return campus_rows(seed, profile, with_clusters=is_early)
+        is_early = seed < FIRST_SEED[profile] + N_RETRIEVED_CAMPUSES
+        return campus_rows(seed, profile, with_retrieval=is_early)
     if what == "runs":
         names, n_fewer = oxford_runs(POSITIONS), max(n_repeats // 5, 1)
         return {"runs": [{"run": n, **row} for n in names for row in run_rows(n, seed, n_fewer)]}
@@ -211,13 +242,11 @@ def _rows(
     if what == "weighting":
         return weighting_rows(case, n_repeats, METHODS if method is None else (method,))
     settings, tolerance_m = options(case), TOLERANCE * case.known_map.spacing_m
-    by_mode = settings | {"estimate": "mode"}
     found: dict[str, Iterable[Row]] = {  # made as they are read
         "starts": (
             {"start": start, "settled_at": settled}
             for start, settled, _ in starts(case, N_STARTS[profile], settings, tolerance_m)
         ),
-        "kidnapping": kidnapping_rows(case, by_mode, 0.05, 5, RECOVERED_WITHIN + HELD),
         "clusters": map(cluster_row, [case.known_map], [case.recording], ["synthetic"], [seed]),
         "particles": particle_rows(case, n_repeats),
         "start_errors": [start_errors(case, settings)],

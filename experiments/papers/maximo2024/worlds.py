@@ -27,10 +27,12 @@ from experiments.papers.maximo2024.places import (
 )
 from experiments.papers.maximo2024.settings import (
     CAMPUS_SHIFT_M,
+    CLUSTERED,
     HELD,
     KIDNAPPED_AFTER,
     LEAST_M,
     METHODS,
+    N_CAMPUS_KIDNAPPINGS,
     N_CAMPUS_STARTS,
     N_KIDNAPPINGS,
     N_REPEATS,
@@ -352,12 +354,15 @@ def cluster_labels(known_map: TopologicalMap, seed: int) -> NDArray[np.int64]:
 
 def cluster_row(known_map: TopologicalMap, recording: Recording, descriptor: str, seed: int) -> Row:
     """Figure 2: share of nodes with a route neighbour in their cluster; retrieval beside."""
+    return _contiguous(known_map, descriptor, seed) | _retrieval(known_map, recording)
+
+
+def _contiguous(known_map: TopologicalMap, descriptor: str, seed: int) -> Row:
     same = np.diff(cluster_labels(known_map, seed)) == 0
     return {
         "descriptor": descriptor,
         "nodes": len(known_map),
         "contiguous": float((np.append(same, False) | np.append(False, same)).mean()),
-        **_retrieval(known_map, recording),
     }
 
 
@@ -377,37 +382,65 @@ def campus_runs(seed: int) -> tuple[Experiment, Experiment]:
     return mapping, mapping.with_values(seed=seed + 500, route=route)  # the same world_seed
 
 
-def campus_rows(seed: int, profile: Profile, *, with_clusters: bool) -> dict[str, Rows]:
-    """All that is judged on simulated clouds, in one campus.
-
-    Parameters
-    ----------
-    with_clusters
-        Describe the clouds in every way, and cluster them.
-    """
+def _campus_case(seed: int) -> tuple[Case, float]:
+    """A campus with its queries, and how many of these there are to a node."""
     mapping, taking = campus_runs(seed)
     mapped, taken = mapping.recording(), taking.recording()
     settings = mapping.options_of("prior.map")
-    tables: dict[str, Rows] = {"clusters": []}
-    for descriptor in describers.KINDS if with_clusters else ():
-        known = from_recording(mapped, descriptor, settings["spacing_m"])
-        fine = from_recording(mapped, descriptor, UMH.spacing_m)
-        queries = describe_clouds(taken, describers.kind(descriptor).describe)
-        row = cluster_row(fine, queries, descriptor, seed)
-        tables["clusters"].append({**row, **_retrieval(known, queries)})
     known = from_recording(mapped, settings["descriptor"], settings["spacing_m"])
     queries = describe_clouds(taken, describers.kind(settings["descriptor"]).describe)
-    case = Case("campus", seed, taking, known, queries)
     per_node = float(known.spacing_m / np.median(np.abs(np.diff(taken.wheels.position_m[:, 0]))))
-    places = {"place": case.recording.log("place")}  # without the clouds
-    bare = replace(case, recording=replace(case.recording, logs=places))
-    n_trials, n_after = N_KIDNAPPINGS[profile], 4 * RECOVERED_WITHIN
+    return Case("campus", seed, taking, known, queries), per_node
+
+
+def _without_clouds(case: Case) -> Case:
+    places = {"place": case.recording.log("place")}
+    return replace(case, recording=replace(case.recording, logs=places))
+
+
+def campus_rows(seed: int, profile: Profile, *, with_retrieval: bool) -> dict[str, Rows]:
+    """Weightings and starts in one campus.
+
+    Parameters
+    ----------
+    with_retrieval
+        Also describe the clouds in every way.
+    """
+    case, _ = _campus_case(seed)
+    bare = _one_query_a_node(_without_clouds(case))
     return {
-        **tables,
-        **weighting_rows(_one_query_a_node(bare), N_REPEATS[profile]),
+        "retrieval": list(_retrieval_by_clouds(seed)) if with_retrieval else [],
+        **weighting_rows(bare, N_REPEATS[profile]),
         "campus_starts": list(_campus_starts(case, N_CAMPUS_STARTS[profile])),
-        "kidnapping": list(kidnapping_rows(bare, {}, 0.02, n_trials, n_after, per_node)),
     }
+
+
+def _retrieval_by_clouds(seed: int) -> Iterator[Row]:
+    mapping, taking = campus_runs(seed)
+    mapped, taken = mapping.recording(), taking.recording()
+    for descriptor in describers.KINDS:
+        known = from_recording(mapped, descriptor, mapping.options_of("prior.map")["spacing_m"])
+        queries = describe_clouds(taken, describers.kind(descriptor).describe)
+        yield {"descriptor": descriptor, **_retrieval(known, queries)}
+
+
+def cloud_clusters(seed: int) -> Iterator[Row]:
+    """Describe the clouds of a campus in each way that k-means allows for, and cluster them."""
+    (mapping, _) = campus_runs(seed)
+    mapped = mapping.recording()
+    for descriptor in CLUSTERED:
+        yield _contiguous(from_recording(mapped, descriptor, UMH.spacing_m), descriptor, seed)
+
+
+def kidnappings(name: str, seed: int, profile: Profile) -> Iterator[Row]:
+    """Kidnappings in one world of a route, or in one campus."""
+    if name == "campus":
+        case, per_node = _campus_case(seed)
+        n, n_after = N_CAMPUS_KIDNAPPINGS[profile], 4 * RECOVERED_WITHIN
+        return kidnapping_rows(_without_clouds(case), {}, 0.02, n, n_after, per_node)
+    case = make_case(name, seed)
+    by_mode = options(case) | {"estimate": "mode"}
+    return kidnapping_rows(case, by_mode, 0.05, N_KIDNAPPINGS, RECOVERED_WITHIN + HELD)
 
 
 def _one_query_a_node(case: Case) -> Case:

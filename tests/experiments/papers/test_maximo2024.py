@@ -188,12 +188,10 @@ def test_mx5_is_judged_on_descriptors_of_clouds():
     shares = {"descriptor": "m2dp", "contiguous": [0.9, 0.92, 0.91]}
     clouds = pd.DataFrame({"geometry": "campus", **shares})
     made = clouds.assign(geometry="umh", descriptor="synthetic", contiguous=0.99)
-    both = pd.concat([clouds, made])
-    assert headlines(claims.mx5(both)) == ["reproduced"]
-    worse = pd.concat([clouds.assign(contiguous=[0.5, 0.52, 0.51]), made])
-    assert headlines(claims.mx5(worse)) == ["not_reproduced"]
-    assert list(claims.mx5(clouds.assign(descriptor="scan_context"))) == []
-    said = concluded("maximo2024", claims.mx5(both)).sentence
+    assert headlines(claims.mx5(made, clouds)) == ["reproduced"]
+    worse = clouds.assign(contiguous=[0.5, 0.52, 0.51])
+    assert headlines(claims.mx5(made, worse)) == ["not_reproduced"]
+    said = concluded("maximo2024", claims.mx5(made, clouds)).sentence
     assert "of 91 % (campus clouds, m2dp) of the nodes; with made descriptors" in said
 
 
