@@ -11,12 +11,14 @@ LABELS: dict[str, tuple[str, ...]] = {
     "repeats": ("n_particles",),
     "distance": (),
     "association": ("association", "p0"),
+    "divergence": ("association", "p0"),
     "resampling": ("resampling", "ess_share"),
     "noise": (),
 }
 # Tables whose worlds are added until these claims are decided
 DESIGNED = {"particles": ["GI1", "GI3"], "laps": ["GI1"], "distance": ["GI4", "GI5"],
-            "association": ["GI7"]}  # fmt: skip
+            "divergence": ["GI7"]}  # fmt: skip
+SHARED = {"divergence": "association"}  # tables whose runs are of another's configuration
 N_QUICK = 2  # worlds of the quick profile
 CELL_M = 0.1  # of the occupancy grids
 N_REPEATS = {Profile.FULL: 20, Profile.QUICK: 2}  # of a run, or of the images over one drive
@@ -24,6 +26,7 @@ REGION_ARMS = ((10, 10), (200, 3), (200, 10), (200, 20), (1000, 10))  # particle
 FEWER = {Profile.FULL: {}, Profile.QUICK: {200: 50, 1000: 100}}  # particles in their place
 N_DRAWS = {Profile.FULL: 8, Profile.QUICK: 2}  # of the wheel errors
 N_TIMINGS = {Profile.FULL: 5, Profile.QUICK: 2}
+DESCRIPTORS = 0.9  # their noise in the headline of GI7
 P0 = 1e-3  # in the rows of estimators without a p0
 FARTHEST_M = 20.0  # images are drawn with all landmarks within this distance
 LAG_M = 20.0  # ground is revisited when the robot was there at least this much path ago

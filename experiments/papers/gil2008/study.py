@@ -70,11 +70,8 @@ def run(profile: Profile, out: Results, on_progress: Progress) -> None:
     fixed = [run for run in plan(profile) if run[0] not in settings.DESIGNED]
     calls = [*((rows_of, part) for part in _grouped(fixed)), *regions]
     tables = tables_of(operator.call, calls, lambda share: on_progress(0.5 * share))
-    for name, claims in settings.DESIGNED.items():
-        tables |= run_worlds(
-            "gil2008", claims, profile, partial(_worlds, name, profile),
-            partial(_judged, name),
-        )  # fmt: skip
+    for name in settings.DESIGNED:
+        tables |= _in_worlds(name, profile)
     on_progress(0.9)
     out.write_tables(**tables, cost=cost_by_landmarks(settings.N_TIMINGS[profile], 2))
     write_arrays(out)
@@ -109,10 +106,32 @@ def _is_headline(run: Experiment) -> bool:
     return printed and not camera.correlated and not camera.max_observations
 
 
+def _is_of_gi7(run: Experiment) -> bool:
+    """Whether a run is one of GI7's headlines: descriptors and p0 in the middle of their ranges."""
+    camera = sensor_of(run.sensors(), "stereo", StereoCamera)
+    p0 = run.options_of("estimator").get("p0", settings.P0)
+    return (
+        _is_headline(run) and camera.sigma_descriptor == settings.DESCRIPTORS and p0 == settings.P0
+    )
+
+
+def _divergence(profile: Profile, _: Progress) -> Mapping[str, pd.DataFrame]:
+    return _in_worlds("divergence", profile)
+
+
+def _in_worlds(name: str, profile: Profile) -> Mapping[str, pd.DataFrame]:
+    """A table in worlds that are added until its claims are decided."""
+    rows_in, judge = partial(_worlds, name, profile), partial(_judged, name)
+    return run_worlds("gil2008", settings.DESIGNED[name], profile, rows_in, judge)
+
+
+PARTS = {"divergence": _divergence}
+
+
 def _judged(name: str, made: Mapping[str, pd.DataFrame]) -> list[Claim]:
     """The claims that say whether a table needs more worlds."""
     given = designs("gil2008")
-    if name == "association":
+    if name == "divergence":
         return list(gi7(made[name]))
     if name == "distance":
         return [*gi4(made[name]), *gi5(made[name])]
@@ -136,7 +155,9 @@ def plan_table(
         seeds = range(settings.N_QUICK)
     worlds = [] if seeds is None else seeds[:1] if table == "repeats" else seeds
     given = [f"seed={','.join(map(str, worlds))}"] if worlds else []
-    for one in plan_experiments([f"study=gil2008/{table}", *given]):
+    for one in plan_experiments([f"study=gil2008/{settings.SHARED.get(table, table)}", *given]):
+        if table == "divergence" and not _is_of_gi7(one):
+            continue
         drawn = one.options_of("recording")
         if drawn["draw"] < n_draws and drawn["image_draw"] <= n_repeats:
             yield table, one.with_values(repeats=min(one.repeats, n_repeats))
@@ -204,7 +225,8 @@ def remake(table: str, row: Cells) -> Remake | None:
     """The call that makes a row again; None if no run is like it."""
     if table.startswith("region_"):
         return remake_region("gil2008", region_run, table, row)
-    for one in plan_experiments([f"study=gil2008/{table}", f"seed={row['seed']:.0f}"]):
+    study = settings.SHARED.get(table, table)
+    for one in plan_experiments([f"study=gil2008/{study}", f"seed={row['seed']:.0f}"]):
         camera = sensor_of(one.sensors(), "stereo", StereoCamera)
         shown = {"n_seen": camera.max_observations, "rule": camera.selection}
         labels = dataclasses.asdict(Scene.of(one)) | labels_of(table, one) | shown
