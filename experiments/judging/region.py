@@ -142,7 +142,7 @@ class Region:
             The printed level that the anchor has, in words.
         """
         value, low, high = map(_percent, (self.share.value, self.share.low, self.share.high))
-        said = [f"It holds in {value} % [{low}, {high}] of the region of free settings."]
+        said = [f"The claim holds in {value} % [{low}, {high}] of the region of free settings."]
         is_one = self.decided_by != NONE_ALONE
         if self.along:
             said += [f"{'' if is_one else 'No single setting decides; '}{self.along}."]

@@ -103,10 +103,11 @@ def power_stated(rows: Sequence[Claim]) -> str:
     if not known:
         return ""
     least = min(known, key=lambda row: row.power)
-    what = f"decide {least.effect}"
+    what = f"decide {least.effect}, if there is one"
     if least.effect == EQUIVALENCE:
-        what = "show equivalence, if there is no difference,"
-    return f" Data of this size {what} with a power of {min(least.power, 0.99):.2f}."
+        what = "show that two arms are alike, if they are"
+    often = f"{100.0 * min(least.power, 0.99):.0f} of 100"
+    return f" Of studies of this size, {often} would {what}."
 
 
 def plain(number: float | Interval, digits: int = 2) -> str:

@@ -83,14 +83,16 @@ def test_what_is_only_shown_stands_beside():
 def test_an_undecided_sentence_states_the_power_of_its_size():
     assert verdict_of(GOOD).sentence == "There are 1 rows."
     assert verdict_of(GOOD, OPEN).sentence == (
-        "There are 2 rows. Data of this size show equivalence, if there is no difference, with a "
-        "power of 0.99."
+        "There are 2 rows. Of studies of this size, 99 of 100 would show that two arms are alike, "
+        "if they are."
     )
     low = judge_bounds(FUSED, "a ratio", Interval(1.05, 0.95, 1.16), at_most=1.1)
-    assert verdict_of(OPEN, low).sentence.endswith("decide an effect of 10 % with a power of 0.46.")
+    assert verdict_of(OPEN, low).sentence.endswith(
+        "46 of 100 would decide an effect of 10 %, if there is one."
+    )
     unknown = dataclasses.replace(OPEN, power=math.nan)
     assert verdict_of(unknown).sentence == "There are 1 rows."
-    assert "power of 0.99" in verdict_of(OPEN, beside(low), unknown).sentence
+    assert "99 of 100 would" in verdict_of(OPEN, beside(low), unknown).sentence
 
 
 def test_the_power_of_a_size_is_that_of_tests_of_its_size():
@@ -216,7 +218,7 @@ def test_every_claim_has_one_verdict_and_a_plain_sentence(tracked):
         assert "nan" not in each.sentence
         assert not re.search(r"unknown times|unknown share|\de\+\d", each.sentence)
         if each.verdict is Verdict.UNDECIDED:
-            why = r"with a power of 0\.\d\d\.|interval contains [28]0 %, the limit"
+            why = r"of 100 would |interval contains [28]0 %, the limit"
             assert re.search(why, each.sentence)
 
 

@@ -192,7 +192,7 @@ def test_mx5_is_judged_on_descriptors_of_clouds():
     worse = clouds.assign(contiguous=[0.5, 0.52, 0.51])
     assert headlines(claims.mx5(made, worse)) == ["not_reproduced"]
     said = concluded("maximo2024", claims.mx5(made, clouds)).sentence
-    assert "of 91 % (campus clouds, m2dp) of the nodes; with made descriptors" in said
+    assert "(M2DP); more than 80 % are asked. With made descriptors" in said
 
 
 def test_our_own_claims_follow_their_tables():
@@ -214,7 +214,7 @@ def test_our_own_claims_follow_their_tables():
     )
     assert [c.verdict for c in claims.mx8(trials)] == ["reproduced", "reproduced"]
     found = concluded("maximo2024", claims.mx8(trials))
-    assert "With injection 100 % of kidnapped robots are found again" in found.sentence
+    assert "at least 100 % of simulated kidnapped robots are found again" in found.sentence
     quick = trials.assign(settled_at=4.0)  # found again even without injection
     assert [c.verdict for c in claims.mx8(quick)] == ["not_reproduced", "reproduced"]
     slow = trials.assign(settled_at=25.0)
