@@ -100,7 +100,7 @@ class Run:
             f"{row['status']}, {row['status_detail']}" if row["status"] != "ok" else "",
             "" if error_m is None else f"position RMSE {error_m * 1000.0:.3g} mm",
             "" if nees is None else f"NEES {nees:.3g}",
-            "" if step_us is None else f"{step_us / 1000.0:.3g} ms a step",
+            "" if step_us is None else f"{step_us / 1000.0:.3g} ms per step",
         ]
         world = row.get("choice.world", "a recording")
         return f"Run({row['choice.estimator']} on {world}: {', '.join(filter(None, facts))})"

@@ -37,7 +37,7 @@ from experiments.runs.dependencies.recorder import digest_of_all, recorded
 from experiments.runs.evaluate import limit_blas
 from experiments.runs.paths import results, short
 from experiments.viewing.style import save_figure
-from sim.errors import InputError
+from sim.errors import InputError, nearest
 
 _APART = "_tuning"  # the table on other seeds from which parameters were chosen
 _AGAIN = "reproduced"  # folder in the results
@@ -326,7 +326,7 @@ def _put_in_place(new: Path, old: Path, paper: str) -> None:
 
 def _chosen(only: str | None) -> tuple[str, ...]:
     if only is not None and only not in STUDIES:
-        raise InputError(f"the paper must be one of {', '.join(STUDIES)}, got {only!r}")
+        raise InputError(f"no paper or study named {only}; {nearest(only, STUDIES)}")
     return STUDIES if only is None else (only,)
 
 

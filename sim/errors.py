@@ -13,6 +13,7 @@ T = TypeVar("T")
 _UNPRINTABLE = re.compile(
     "[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff\ufeff\ufffe\uffff]"
 )
+_LISTED = 12  # names that a message lists
 _BEGIN, _END = 1500, 500  # characters of a long message that are kept: its remedy comes last
 
 
@@ -38,18 +39,32 @@ def printable(text: str) -> str:
     return _UNPRINTABLE.sub("?", text)
 
 
+def nearest(name: str, known: Iterable[str], place: str = "", there: str = "there are: ") -> str:
+    """Say which of the known names is spelled most like one, and which others there are.
+
+    Examples
+    --------
+    >>> nearest("sart", ["map", "start"])
+    'did you mean start? there are: start, map'
+    """
+    names = list(known)
+    near = difflib.get_close_matches(str(name), names, n=3)  # a file's may be any value
+    listed = [f"{place}{one}" for one in dict.fromkeys([*near, *names])]
+    meant = f"did you mean {listed[0]}? " if near else ""
+    more = f" and {len(listed) - _LISTED} more" if len(listed) > _LISTED else ""
+    return f"{meant}{there}{', '.join(listed[:_LISTED]) or 'none'}{more}"
+
+
 def describe_unknown(key: str, known: Iterable[str], where: str = "") -> str:
-    """Say that a key of a place is unknown, and which are known there, the nearest spelled first.
+    """Say that a key of a place is unknown, which may be meant, and which are known there.
 
     Examples
     --------
     >>> describe_unknown("sart", ["map", "start"], "prior")
-    'unknown key prior.sart; known: prior.start, prior.map'
+    'unknown key prior.sart; did you mean prior.start? known: prior.start, prior.map'
     """
-    names, place = list(known), f"{where}." if where else ""
-    near = difflib.get_close_matches(str(key), names, n=3)  # a file's may be any value
-    listed = [f"{place}{name}" for name in dict.fromkeys([*near, *names])]
-    return f"unknown key {place}{key}; known: {', '.join(listed) or 'none'}"
+    place = f"{where}." if where else ""
+    return f"unknown key {place}{key}; {nearest(key, known, place, 'known: ')}"
 
 
 @contextmanager

@@ -203,7 +203,8 @@ def find(target: Any, where: str) -> Callable[..., Any]:
             module: Any = __import__(module_name, fromlist=["_"])  # is seen by who records it
         except ModuleNotFoundError as error:
             raise InputError(
-                f"{where}._target_={target}: no module {error.name}; is its folder on PYTHONPATH?"
+                f"{where}._target_={target}: no module {error.name} in the current folder, "
+                "in that of --config-dir, or on PYTHONPATH"
             ) from error
     found: Any = getattr(module, name, None)
     require(callable(found), f"{where}._target_={target}: {module_name} has no class {name}")

@@ -1,7 +1,7 @@
 """Your own sensors: a beacon like GPS and a second laser, fused by your own estimator.
 
 The beacon and the estimator lie in `beacon/`, each in a file, with a YAML that names it. On the
-command line: `PYTHONPATH=beacon estima run --config-dir beacon sensors=two_lasers_beacon
+command line: `estima run --config-dir beacon sensors=two_lasers_beacon
 estimator=fused`.
 """
 

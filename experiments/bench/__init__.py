@@ -4,7 +4,7 @@ import importlib
 
 from experiments.bench.measure import as_json as json_text
 from experiments.bench.measure import as_table
-from sim.errors import require
+from sim.errors import nearest, require
 
 # name -> modules of this package, each with `run()`
 SUITES = {
@@ -40,7 +40,8 @@ def run_bench(name: str, *, as_json: bool, against: str | None = None) -> str:
     InputError
         For an unknown name.
     """
-    require(name in (*SUITES, "all"), f"unknown benchmark {name}; known: {', '.join(SUITES)}, all")
+    known = (*SUITES, "all")
+    require(name in known, f"no benchmark named {name}; {nearest(name, known)}")
     suites = [suite for suite in SUITES if name in (suite, "all")]
     if against is not None:
         from experiments.bench.against import run_against

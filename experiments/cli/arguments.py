@@ -10,6 +10,7 @@ from pathlib import Path
 
 from omegaconf import OmegaConf
 
+from experiments.cli.flags import find_own_code
 from experiments.runs.compose import open_composer, searched
 from experiments.runs.console import show
 from experiments.runs.experiment import Experiment
@@ -59,6 +60,8 @@ class CommandLine:
         except argparse.ArgumentError as error:
             raise InputError(f"{error}; {known}") from error
         require(not others, f"{' '.join(others)}: {known}")
+        if given.config_dir is not None:
+            find_own_code(Path(given.config_dir))
         return cls(given.overrides, given.config_dir, given.cfg is not None, given.resolve)
 
 

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import inspect
+import sys
 import typing
 from collections.abc import Callable
 from pathlib import Path
@@ -27,8 +28,15 @@ Overrides = Annotated[
 ]
 
 
+def find_own_code(folder: Path | None = None) -> None:
+    """Let `_target_` name modules of a folder and of the current one, behind all others."""
+    sys.path.extend(str(place.resolve()) for place in (folder, Path()) if place is not None)
+
+
 def _check_folder(folder: Path | None) -> Path | None:
     require(folder is None or folder.is_dir(), f"--config-dir must name a folder, got {folder}")
+    if folder is not None:
+        find_own_code(folder)
     return folder
 
 

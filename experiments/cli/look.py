@@ -12,7 +12,7 @@ from experiments.cli import completion
 from experiments.cli.flags import ConfigDir, Overrides
 from experiments.runs import columns, paths
 from experiments.runs.console import show
-from sim.errors import require
+from sim.errors import nearest, require
 from sim.files import read_text
 
 
@@ -75,7 +75,7 @@ def _describe(group: str, name: str, config_dir: Path | None) -> None:
     from experiments.runs.schema import describe_option
 
     names = completion.options(group, config_dir)
-    known = f"no {group} named {name}; there are: {', '.join(names)}"
+    known = f"no {group} named {name}; {nearest(name, names)}"
     require(name in names or group in _groups_of(name, config_dir), known)
     if group == "study":
         show(read_text(_file_of(group, name, config_dir)).rstrip())
@@ -94,8 +94,10 @@ def _groups_of(name: str, config_dir: Path | None) -> list[str]:
 
 def _group_of(name: str, config_dir: Path | None) -> str:
     """The one group of an option or a sensor that is called by its name alone."""
-    groups, known = _groups_of(name, config_dir), ", ".join(completion.GROUPS)
-    require(groups, f"no group or option {name}; the groups are: {known}, metrics")
+    groups = _groups_of(name, config_dir)
+    options = [n for g in completion.GROUPS for n in completion.options(g, config_dir)]
+    known = [*completion.GROUPS, "metrics", *options]
+    require(groups, f"no group or option {name}; {nearest(name, known)}")
     several = " or ".join(f"`estima options {group} {name}`" for group in groups)
     require(len(groups) == 1, f"{name} is an option of several groups: {several}")
     return groups[0]

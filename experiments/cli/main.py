@@ -71,38 +71,50 @@ def options_of_all(
         os.environ[TRUST] = "1"
 
 
-_COMMANDS: dict[str, Callable[..., None]] = {  # as `estima --help` lists them
-    "run": run.run,
-    "record": run.record,
-    "info": logs.info,
-    "convert": logs.convert,
-    "solve": logs.solve,
-    "options": look.options,
-    "recommend": look.recommend,
-    "view": look.view,
-    "map": look.build_map,
-    "score": score.score,
-    "compare": score.compare,
-    "calibrate": logs.calibrate,
-    "twin": logs.twin,
-    "tune": run.tune,
-    "conform": score.conform,
-    "check": project.check,
-    "bisect": project.bisect,
-    "history": project.history,
-    "bench": project.bench,
-    "table": tables.table,
-    "plot": tables.plot,
-    "reproduce": project.reproduce,
-    "audit": project.audit,
-    "results": project.list_results,
-    "report": tables.report,
-    "cache": project.cache,
-    "export-table": tables.export_table,
+_COMMANDS: dict[str, dict[str, Callable[..., None]]] = {  # as `estima --help` lists them
+    "Run": {
+        "run": run.run,
+        "options": look.options,
+        "recommend": look.recommend,
+        "record": run.record,
+        "view": look.view,
+        "map": look.build_map,
+    },
+    "Sweeps": {
+        "table": tables.table,
+        "plot": tables.plot,
+        "report": tables.report,
+        "tune": run.tune,
+        "cache": project.cache,
+    },
+    "Logs and trajectories": {
+        "info": logs.info,
+        "convert": logs.convert,
+        "solve": logs.solve,
+        "score": score.score,
+        "compare": score.compare,
+        "calibrate": logs.calibrate,
+        "twin": logs.twin,
+    },
+    "Your own method": {
+        "conform": score.conform,
+        "check": project.check,
+        "bisect": project.bisect,
+        "history": project.history,
+        "bench": project.bench,
+    },
+    "The papers": {
+        "reproduce": project.reproduce,
+        "audit": project.audit,
+        "results": project.list_results,
+        "export-table": tables.export_table,
+    },
 }
-for _name, _command in _COMMANDS.items():
-    app.command(_name, context_settings=PASS_ON if _name == "run" else None)(_command)
-app.add_typer(submit.app, name="submit")
+for _panel, _commands in _COMMANDS.items():
+    for _name, _command in _commands.items():
+        _context = PASS_ON if _name == "run" else None
+        app.command(_name, context_settings=_context, rich_help_panel=_panel)(_command)
+app.add_typer(submit.app, name="submit", rich_help_panel="Your own method")
 
 
 def main() -> None:

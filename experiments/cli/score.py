@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from experiments.cli import completion
-from experiments.cli.flags import ConfigDir, Topic, gathered
+from experiments.cli.flags import ConfigDir, Topic, find_own_code, gathered
 from experiments.runs.console import show
 
 
@@ -172,6 +172,7 @@ def conform(
     from experiments.gate.conform import conform_target
     from experiments.runs.compose import searched
 
+    find_own_code()
     results = conform_target(target, arguments or [], searched(config_dir))
     for result in results:
         print(f"{'pass' if result.passed else 'FAIL':<5}{result.name}: {result.message}")

@@ -15,11 +15,12 @@ from experiments.report.plot import Size, sweep_figure
 from experiments.report.sweep_page import extremes, picture_path, write_sweep_page
 from experiments.report.table import as_lines, notes, statuses, write_table
 from experiments.runs import paths
+from experiments.runs.columns import ANSWER
 from experiments.runs.console import pluralize, progress, show, warn
 from experiments.runs.row import Outcome, write_frame
 from experiments.sweeps.again import draw_recorded_run, short_key
 from experiments.sweeps.collect import folder_of, suggest_axes, unfinished_sweeps
-from experiments.sweeps.summary import summary
+from experiments.sweeps.summary import ERROR, summary
 from experiments.sweeps.winner import find_winner
 from experiments.sweeps.work import may_run
 from experiments.viewing.play import Showing
@@ -35,6 +36,9 @@ def write_rows(rows: pd.DataFrame, out: Path) -> str:
     return f"{out}: {pluralize(len(rows), 'row')}, {len(rows.columns)} columns"
 
 
+_NARROW = (ERROR, f"{ANSWER}nees_mean")
+
+
 def table_of(
     rows: pd.DataFrame,
     name: str,
@@ -46,7 +50,11 @@ def table_of(
     efficiency: bool = False,
 ) -> str:
     """Mean errors of a sweep as lines, or in a file; then it says how many rows that has."""
+    narrow = size == "column" and not metrics  # one table as wide as a column
+    if narrow:  # with `against`, the ratio of the errors takes the place of the NEES
+        metrics = [m for m in _NARROW[: 1 if against else 2] if m.removeprefix(ANSWER) in rows]
     found = summary(rows, against, metrics, efficiency=efficiency)
+    found = found.assign(with_remarks=0) if narrow else found
     note = notes(found, against)
     if out is not None:
         write_table(found, note, out, Path(name).name, size)

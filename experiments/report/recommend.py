@@ -272,7 +272,7 @@ class Nearest:
             words = [f"  {name:{width}}  position RMSE {_mm(error)} mm"]
             words[0] += "" if math.isnan(low) else f" [{_mm(low)}, {_mm(high)}]"
             words += [f"in {sum(r.runs for r in rows)} runs"]
-            words += [f"{significant(times[name] * 1e3, 2)} ms a Frame"] if name in times else []
+            words += [f"{significant(times[name] * 1e3, 2)} ms per Frame"] if name in times else []
             lines.append(", ".join(words) + "  (not installed)" * (name in absent))
         more = len(errors) - _MOST_SHOWN
         return [*lines, *([f"  and {more} with larger errors"] if more > 0 else []), ""]

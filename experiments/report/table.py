@@ -66,7 +66,7 @@ def notes(found: pd.DataFrame, against: str | None) -> str:
     if found["incomplete"].any():
         parts.append("incomplete: runs without a pose for some of the drive, never the best.")
     if found["with_remarks"].any():
-        parts.append("with remarks: the sweep's page, and `status_detail` of its rows, say which.")
+        parts.append("With remarks: a method gave a warning, which the sweep's page names.")
     if differs:
         parts.append(
             f"*: differs from {against} (paired t tests over recordings; 5 % for the table, Holm)."

@@ -1,6 +1,5 @@
 """Terminal output: progress, and the one line that ends a failed command."""
 
-import difflib
 import errno
 import math
 import os
@@ -14,7 +13,7 @@ from contextlib import contextmanager, nullcontext, suppress
 from typing import Any, NoReturn, TextIO
 
 from experiments.runs.paths import option_names
-from sim.errors import InputError, printable
+from sim.errors import InputError, nearest, printable
 
 _QUIET_S = 2.0  # what ends sooner shows no progress
 _LINE_EVERY_S = 10.0  # where the output is a file
@@ -174,9 +173,7 @@ def _refusal(error: BaseException) -> str | None:
         return None
     group, _, name = missing.rpartition("/")
     every = sorted({*options, *option_names(group)})
-    near = difflib.get_close_matches(name, every, n=1)
-    meant = f"did you mean {near[0]}? " if near else ""
-    return f"no {group} named {name}; {meant}there are: {', '.join(every)}"
+    return f"no {group} named {name}; {nearest(name, every)}"
 
 
 def _configuration_errors() -> tuple[type[Exception], ...]:

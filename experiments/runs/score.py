@@ -298,9 +298,9 @@ def as_text(row: Row, scored: ScoredTrajectory | None, how: Scoring) -> str:
         return "\n".join(by_relations)
     errors = error_table(scored)
     heads = list(next(iter(errors.values())))
-    lines = [f"  {'':<24}" + "".join(f"{head:>19}" for head in heads)]
+    lines = [f"  {'':<24}" + "".join(f"{head:>13}" for head in heads)]
     for error, values in errors.items():
-        lines.append(f"  {error:<24}" + "".join(f"{values[head]:>19.12g}" for head in heads))
+        lines.append(f"  {error:<24}" + "".join(f"{values[head]:>13.6g}" for head in heads))
     return "\n".join([describe_scoring(scored, how), *lines, *by_relations])
 
 

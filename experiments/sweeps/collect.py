@@ -26,7 +26,7 @@ from experiments.runs.paths import results
 from experiments.runs.store import fresh_rows, read_runs, stale_because
 from experiments.runs.version import code_version
 from experiments.sweeps.commands import MOST_BYTES
-from sim.errors import InputError, printable, require
+from sim.errors import InputError, nearest, printable, require
 from sim.files import read_text
 
 FEW = 12  # colours, and panels
@@ -117,8 +117,8 @@ def folder_of(name: str) -> Path:
     for path in (runs / name, Path(name)):
         if path.exists():
             return path
-    there = sorted(p.name for p in runs.glob("*") if p.is_dir())
-    raise InputError(f"no sweep named {name}; there are: {', '.join(there) or 'none'}")
+    there = sorted(p.name for p in runs.glob("*") if p.is_dir() and p.name != "dependencies")
+    raise InputError(f"no sweep named {name}; {nearest(name, there)}")
 
 
 def _check_distinct(table: pd.DataFrame, settings: list[str], path: Path) -> None:

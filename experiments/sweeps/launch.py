@@ -44,7 +44,7 @@ from experiments.sweeps.work import (
     share_path,
 )
 from sim.compiled import ANNOUNCED, note_compiling
-from sim.errors import InputError, how_to_install, require
+from sim.errors import InputError, how_to_install, nearest, require
 from sim.files import require_file, write_text
 
 _JOBS_PER_CORE = 4  # enough to keep all busy to the end, few enough to cost little
@@ -301,6 +301,7 @@ def _tidy(folder: Path) -> None:
 
 
 _LAUNCHING = ("hydra/launcher", "hydra.launcher", "jobs=")
+_LAUNCHERS = ("basic", "joblib", "submitit_local", "submitit_slurm", "ray", "ray_aws")
 _EXTRAS = {"submitit": "slurm", "ray": "ray"}
 
 
@@ -311,8 +312,16 @@ def _check_launcher(launching: Sequence[str]) -> None:
         require(not wrong, f"{argument}: give the number of processes, or -1 for all cores")
         name = argument.partition("=")[2]
         plugin = name.partition("_")[0]
-        chosen = argument.lstrip("+").startswith("hydra/launcher=") and plugin in _EXTRAS
-        if chosen and importlib.util.find_spec(f"hydra_plugins.hydra_{plugin}_launcher") is None:
+        if not argument.lstrip("+").startswith("hydra/launcher="):
+            continue
+        require(
+            name in _LAUNCHERS or importlib.util.find_spec(f"hydra_plugins.{plugin}"),
+            f"no hydra/launcher named {name}; {nearest(name, _LAUNCHERS)} (docs/clusters.md)",
+        )
+        if (
+            plugin in _EXTRAS
+            and importlib.util.find_spec(f"hydra_plugins.hydra_{plugin}_launcher") is None
+        ):
             raise InputError(
                 f"hydra/launcher={name} is an extra that is not installed: "
                 f"{how_to_install(_EXTRAS[plugin])}"

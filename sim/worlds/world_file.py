@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from sim.errors import InputError, require
+from sim.errors import InputError, describe_unknown, require
 from sim.worlds.floor_plan import WALL_HEIGHT_M, box_corners, gaps_m, make_descriptors
 from sim.worlds.world import World, facing_second
 from sim.yaml_file import number, read_yaml
@@ -139,7 +139,7 @@ def _box(entry: Any, where: str) -> list[tuple[list[float], list[float]]]:
 
 def _check_keys(entry: Mapping[Any, Any], known: tuple[str, ...], where: str) -> None:
     for key in entry:
-        require(key in known, f"{where}: unknown key {key!r}; known: {', '.join(known)}")
+        require(key in known, f"{where}: {describe_unknown(key, known)}")
 
 
 def _list(document: Mapping[str, Any], key: Any, path: Path, prefix: str = "") -> list[Any]:

@@ -159,7 +159,7 @@ BAD = {
     ),
     "misspelled": (
         "print('{\"mean\": [0, 0, 0], \"covarience\": null}', flush=True)",
-        "unknown key covarience; known: covariance,",
+        "unknown key covarience; did you mean covariance.* known: covariance,",
     ),
     "error": ("print('{\"error\": \"no scan\"}', flush=True)", "the error no scan"),
     "two_lines": (f"print('{_BELIEF}\\n{_BELIEF}', flush=True)", "after its answer|being asked"),

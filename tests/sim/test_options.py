@@ -58,7 +58,7 @@ def test_a_method_keeps_its_options_frozen_and_has_a_state():
         ({"size": 11}, "estimator.size must be a whole number from 1 to 10, got 11"),
         (
             {"nn": 3},
-            "unknown key estimator.nn; known: estimator.n, estimator.kr, estimator.q, .*",
+            "unknown key estimator.nn; did you mean estimator.n\\? known: estimator.n, .*",
         ),
     ],
 )

@@ -82,12 +82,12 @@ def clusters(drawn: dict[str, Arrays]) -> Figure:
     """Figure 2: 40 clusters of the nodes' descriptors by k-means."""
     page, axes = subplots(10.0, 3.8, 1, 3)
     for ax, (name, place) in zip(axes, drawn.items(), strict=True):
-        # neighbours along the route get different colours
+        # four colours in turn, by where a cluster first appears: neighbours along the route differ
         order = np.unique(place["clusters"], return_index=True)[1]
         rank = np.argsort(np.argsort(order))[place["clusters"]]
-        nodes, colours = place["nodes_m"].T, (rank * 7) % len(order)
+        nodes, colours = place["nodes_m"].T, np.array(CYCLE)[rank % 4]
         ax.plot(*nodes, color=WALL, lw=0.4)
-        ax.scatter(*nodes, c=colours, cmap="nipy_spectral", s=9, zorder=2)
+        ax.scatter(*nodes, c=colours, s=9, zorder=2)
         kind = f" ({_DESCRIPTORS[DRAWN_DESCRIPTOR]})" if name.startswith("campus") else ""
         plan_axes(ax, title=NAMES[name] + kind)
     return page

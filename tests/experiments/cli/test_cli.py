@@ -349,11 +349,12 @@ def test_a_users_own_estimator(tmp_path):
     (tmp_path / "mine.py").write_text(code)
     (tmp_path / "mine" / "estimator").mkdir(parents=True)
     (tmp_path / "mine" / "estimator" / "mine.yaml").write_text(options)
-    path = f"{tmp_path}:{ROOT}"
     arguments = ["--config-dir", "mine", "estimator=mine", *QUICK, "name=test_cli"]
-    done = estima("run", *arguments, cwd=tmp_path, PYTHONPATH=path)
+    done = estima("run", *arguments, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    done = estima("conform", "mine:Mine", "variance_per_step=1e-5", cwd=tmp_path, PYTHONPATH=path)
+    done = estima("run", "-m", *arguments, "seed=1,2", cwd=tmp_path)  # its processes find it too
+    assert done.returncode == 0, done.stderr
+    done = estima("conform", "mine:Mine", "variance_per_step=1e-5", cwd=tmp_path)
     assert done.returncode == 0, done.stdout
 
 

@@ -71,7 +71,7 @@ def test_another_run_than_the_rows_is_refused(results, monkeypatch):
     absent = pd.concat([row, pd.Series({"estimator._target_": "nowhere.Mine"})])
     absent = absent[~absent.index.duplicated(keep="last")]
     monkeypatch.setenv("ESTIMA_TRUST", "1")
-    with pytest.raises(InputError, match="no module nowhere; is its folder on PYTHONPATH"):
+    with pytest.raises(InputError, match=r"no module nowhere in .* PYTHONPATH"):
         run_of_row(absent)
     changed = row.copy()
     changed["recording_checksum"] = "other"

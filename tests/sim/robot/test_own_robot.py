@@ -101,5 +101,8 @@ def test_a_robot_is_what_the_simulator_asks_for():
         robot_from_config({"_target_": "sim.sensors.base.Mount"})
     with pytest.raises(InputError, match="must be a dataclass"):
         robot_from_config({"_target_": "sim.errors.InputError"})
-    with pytest.raises(InputError, match=r"^unknown key robot\.track; known: robot\.track_m"):
+    with pytest.raises(
+        InputError,
+        match=r"^unknown key robot\.track; did you mean robot\.track_m\? known: robot\.track_m",
+    ):
         robot_from_config({**SIZES, "track": 1})
