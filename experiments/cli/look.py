@@ -11,7 +11,7 @@ import typer
 from experiments.cli import completion
 from experiments.cli.flags import ConfigDir, Overrides
 from experiments.runs import columns, paths
-from experiments.runs.console import show
+from experiments.runs.console import no_option, show
 from sim.errors import nearest, require
 from sim.files import read_text
 
@@ -75,7 +75,7 @@ def _describe(group: str, name: str, config_dir: Path | None) -> None:
     from experiments.runs.schema import describe_option
 
     names = completion.options(group, config_dir)
-    known = f"no {group} named {name}; {nearest(name, names)}"
+    known = no_option(group, name, names)
     require(name in names or group in _groups_of(name, config_dir), known)
     if group == "study":
         show(read_text(_file_of(group, name, config_dir)).rstrip())

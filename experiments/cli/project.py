@@ -109,8 +109,8 @@ def bench(
     name: Annotated[
         str,
         typer.Argument(
-            help="compile, external, fastslam, formats, graph_slam, growth, icp, mcl, sim, "
-            "smoothing, sweep, sweep_scale, teams, topological, worlds, or all."
+            help="compile, external, fastslam, formats, graph_slam, growth, icp, mcl, score, "
+            "sim, smoothing, sweep, sweep_scale, teams, topological, worlds, or all."
         ),
     ] = "all",
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,

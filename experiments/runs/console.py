@@ -8,7 +8,7 @@ import sys
 import textwrap
 import time
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from typing import Any, NoReturn, TextIO
 
@@ -173,7 +173,14 @@ def _refusal(error: BaseException) -> str | None:
         return None
     group, _, name = missing.rpartition("/")
     every = sorted({*options, *option_names(group)})
-    return f"no {group} named {name}; {nearest(name, every)}"
+    return no_option(group, name, every)
+
+
+def no_option(group: str, name: str, options: Iterable[str]) -> str:
+    """Say that a group has no such option, which may be meant, and what lists all."""
+    others = nearest(name, options)
+    remedy = f"; estima options {group} lists all" if others.endswith(" more") else ""
+    return f"no {group} named {name}; {others}{remedy}"
 
 
 def _configuration_errors() -> tuple[type[Exception], ...]:

@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 
 import estima
-from experiments.runs.row import read_rows
+from experiments.runs import store
 from tests.experiments.cli.test_cli import QUICK as EXACT
 from tests.experiments.cli.test_cli import estima as command
 
@@ -49,7 +49,7 @@ def test_what_it_gives_prints_in_a_line():
     for thing in (recording, recording.truth, run, run.online, next(iter(recording.frames()))):
         assert len(repr(thing)) < 120
     assert re.fullmatch(
-        r"Run\(odometry on a recording: position RMSE [\d.]+ mm, NEES .+ ms a step\)", repr(run)
+        r"Run\(odometry on a recording: position RMSE [\d.]+ mm, NEES .+ ms per step\)", repr(run)
     )
     assert "55 Frames; wheels alone; Truth(55 poses, a map); ok" in repr(recording)
     shown = run._repr_html_()
@@ -113,7 +113,7 @@ def test_a_simulated_recording_is_that_of_the_command_line(folder):
 def test_a_run_has_the_numbers_of_the_command_line(folder):
     done = command("run", *QUICK, "seed=4", "name=cli", "picture=false", cwd=folder)
     assert done.returncode == 0, done.stderr
-    row = read_rows(folder / "results" / "runs" / "cli").iloc[0]
+    row = store.read_runs(folder / "results" / "runs" / "cli").iloc[0]
     run = estima.run(*QUICK, "seed=4", "name=cli", "picture=false")
     again = estima.run(estima.simulate(*QUICK, "seed=4"), "seed=4")
     for found in (run, again):

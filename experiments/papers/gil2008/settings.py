@@ -18,7 +18,7 @@ LABELS: dict[str, tuple[str, ...]] = {
 # Tables whose worlds are added until these claims are decided
 DESIGNED = {"particles": ["GI1", "GI3"], "laps": ["GI1"], "distance": ["GI4", "GI5"],
             "divergence": ["GI7"]}  # fmt: skip
-SHARED = {"divergence": "association"}  # tables whose runs are of another's configuration
+SHARED = {"divergence": "association"}  # tables whose runs another table configures
 N_QUICK = 2  # worlds of the quick profile
 CELL_M = 0.1  # of the occupancy grids
 N_REPEATS = {Profile.FULL: 20, Profile.QUICK: 2}  # of a run, or of the images over one drive

@@ -159,7 +159,10 @@ def test_a_run_prints_its_errors_and_leaves_a_row(tmp_path):
         (["sweeps=[{seed:[1,2]}]"], ["add -m: estima run -m", "sweeps="]),
         (["-o", "/proc/none/est.tum"], ["/proc/none/est.tum: cannot write"]),
         (["robot.kq=1"], ["unknown key robot.kq", "robot.kr", "robot.track_m"]),
-        (["estimator=nosuch"], ["no estimator named nosuch", "fastslam, ", "topological_mcl"]),
+        (
+            ["estimator=nosuch"],
+            ["no estimator named nosuch", "fastslam, ", "estima options estimator lists all"],
+        ),
         (["robot=null"], ["robot=null", "estima options robot"]),
         (["~world"], ["world is missing"]),
         (["~robot.kr"], ["robot.kr", "cannot be left out"]),

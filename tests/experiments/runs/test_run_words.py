@@ -80,7 +80,7 @@ def test_recording_says_how_much_there_is_to_simulate(tmp_path, monkeypatch):
 def announced(_):
     """What a process says when it compiles."""
     with contextlib.redirect_stderr(io.StringIO()) as said:
-        compiled._Announcer().on_start(None)
+        compiled._Announcer().on_start()
     return said.getvalue()
 
 

@@ -159,7 +159,7 @@ def test_wrong_ranges_are_told(settings, complaint):
         (None, "tune must be a mapping"),
         ({}, "tune.trials is missing"),
         ({"trials": 3, "seeds": [0]}, "tune.estimators is missing"),
-        ({"trial": 3}, "unknown key tune.trial; known: tune.trials, tune.seeds, tune.estimators"),
+        ({"trial": 3}, "unknown key tune.trial; did you mean tune.trials"),
         ({"trials": 3, "seeds": [0], "estimators": {}}, "tune.estimators must be"),
         ({"trials": 3, "seeds": [0], "estimators": {"a": {}}}, "tune.estimators.* must be"),
         ({"trials": 3, "seeds": [0, 0], "estimators": {"a": {"b": 1}}}, "twice"),

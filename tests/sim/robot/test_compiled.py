@@ -14,16 +14,16 @@ from tests.fixtures.fakes import circle, tracking_prior
 def test_a_process_says_it_once(capsys):
     for _ in range(2):
         one = _Announcer()
-        one.on_start(None)
-        one.on_start(None)
+        one.on_start()
+        one.on_start()
     assert capsys.readouterr().err.count("compiling") == 2
 
 
 def test_where_it_is_noted_nothing_is_said(tmp_path, capsys):
     one, note = _Announcer(), tmp_path / "compiling"
     for one.note in (note, tmp_path / "gone" / "compiling"):
-        one.on_start(None)
-        one.on_end(None)
+        one.on_start()
+        one.on_end()
     assert note.exists()
     assert not capsys.readouterr().err
 
@@ -32,7 +32,7 @@ def test_a_clock_stands_still_until_the_last_lock_is_given_back():
     now = [10.0]
     clock = _Clock(lambda: now[0])
     for step in (clock.on_start, clock.on_start, clock.on_end, clock.on_end):
-        step(None)
+        step()
         now[0] += 1.0
     assert clock() == 11.0
 
