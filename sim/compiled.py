@@ -133,4 +133,4 @@ class _Compiled:
 
 def njit(**options: Any) -> Callable[[Function], Function]:
     """`numba.njit` with the compiled code cached on disk; the function keeps its type."""
-    return lambda function: cast(Function, _Compiled(function, options))
+    return lambda function: cast("Any", _Compiled(function, options))

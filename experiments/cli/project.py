@@ -103,7 +103,7 @@ def bench(
     name: Annotated[
         str,
         typer.Argument(
-            help="compile, external, fastslam, formats, graph_slam, growth, icp, mcl, sim, "
+            help="compile, external, fastslam, formats, graph_slam, growth, icp, mcl, score, sim, "
             "smoothing, sweep, sweep_scale, teams, topological, worlds, or all."
         ),
     ] = "all",
