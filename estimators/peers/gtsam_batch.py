@@ -56,10 +56,11 @@ class GtsamBatch(GtsamBatchOptions):
             covariance = problem.motion_covariances[k]
             first, second = int(problem.first[k]), int(problem.second[k])
             model.add_motion(graph, first, second, Gaussian(motion, covariance))
+        seen = problem.pose_rows.tolist(), problem.landmark_rows.tolist()
+        model.add_seen(graph, *seen, np.asarray(problem.points_in_camera))
         known: set[int] = set()
         for k, point in enumerate(problem.points_in_camera):
             pose, landmark = int(problem.pose_rows[k]), int(problem.landmark_rows[k])
-            model.add_seen(graph, pose, landmark, point)
             if landmark not in known:
                 known.add(landmark)
                 model.add_landmark(values, landmark, camera.place(guess[pose], point))

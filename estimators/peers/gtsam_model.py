@@ -4,6 +4,7 @@ A planar pose is a Pose3 held to the plane, because GTSAM's stereo factor takes 
 covariances of `StereoModel` (column, row and disparity) and of the wheels.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -111,19 +112,17 @@ class GtsamModel:
         graph.add(self._gtsam.PriorFactorPose3(key, at, self._flat_noise))
         values.insert(key, at)
 
-    def add_seen(self, graph: Any, pose: int, landmark: int, point_in_camera: Array) -> None:
-        """Add an observation of a landmark at a point (3,) in the camera frame."""
-        measured = self._by_image @ self._camera.to_image(point_in_camera)
-        graph.add(
-            self._gtsam.GenericStereoFactor3D(
-                self._gtsam.StereoPoint2(*measured),
-                self._stereo_noise,
-                self.pose_key(pose),
-                self.landmark_key(landmark),
-                self._calibration,
-                self._mount,
-            )
-        )
+    def add_seen(
+        self, graph: Any, poses: Sequence[int], landmarks: Sequence[int], points: Array
+    ) -> None:
+        """Add observations of landmarks at points (K, 3) in the camera frames of poses."""
+        make, place = self._gtsam.GenericStereoFactor3D, self._gtsam.StereoPoint2
+        noise, calibration, mount = self._stereo_noise, self._calibration, self._mount
+        first_pose, first_landmark = self.pose_key(0), self.landmark_key(0)
+        measured = (self._camera.to_image(points) @ self._by_image.T).tolist()
+        for pose, landmark, at in zip(poses, landmarks, measured, strict=True):
+            keys = first_pose + pose, first_landmark + landmark
+            graph.add(make(place(*at), noise, *keys, calibration, mount))
 
     def add_landmark(self, values: Any, landmark: int, guess: Array) -> None:
         """Add a landmark's first value (3,) m in map."""
@@ -211,11 +210,13 @@ class Isam2:
         graph, values = model.graph_and_values()
         model.add_pose(graph, values, i, guess)
         model.add_motion(graph, i - 1, i, motion)
-        for point, landmark in zip(points, ids.tolist(), strict=True):
-            model.add_seen(graph, i, landmark, point)
-            if landmark not in self._known:
-                self._known.add(landmark)
-                model.add_landmark(values, landmark, self.camera.place(guess, point))
+        landmarks = ids.tolist()
+        model.add_seen(graph, [i] * len(landmarks), landmarks, points)
+        if not self._known.issuperset(landmarks):
+            for landmark, place in zip(landmarks, self.camera.place(guess, points), strict=True):
+                if landmark not in self._known:
+                    self._known.add(landmark)
+                    model.add_landmark(values, landmark, place)
         self._isam.update(graph, values)
         for _ in range(self._believed.updates - 1):
             self._isam.update()

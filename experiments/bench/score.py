@@ -1,12 +1,13 @@
 """What scoring a trajectory costs beside evo, for the same number from the same files."""
 
+import os
 import re
 import resource
 import statistics
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from experiments.bench.measure import Measurement
@@ -30,24 +31,24 @@ def run() -> Iterator[Measurement]:
         write_recording(truth, recording)
         stamps, poses = recording.known_truth.stamps, recording.known_truth.poses
         write_tum(path, stamps, poses + 0.01 * stamps[:, None])
-        ours = [sys.executable, "-m", "experiments.cli", "--results", folder]
+        place = {**os.environ, "ESTIMA_RESULTS": folder}
         commands = [
-            [*ours, "score", str(log), str(path), "--match", "nearest"],
+            [sys.executable, "-m", "experiments.cli", "score", str(log), str(path)],
             [str(evo), "tum", str(truth), str(path)],
         ]
-        first, second = (_rmse_m(_cpu_s(command)[0]) for command in commands)
+        first, second = (_rmse_m(_cpu_s(command, place)[0]) for command in commands)
         require(abs(first - second) < 1e-6, f"evo says {second} m, estima {first} m")
-        times = [[_cpu_s(command)[1] for command in commands] for _ in range(_ROUNDS)]
+        times = [[_cpu_s(command, place)[1] for command in commands] for _ in range(_ROUNDS)]
     ratio = statistics.median(own / theirs for own, theirs in times)
     own_s, evo_s = (statistics.median(column) for column in zip(*times, strict=True))
     note = f"{own_s:.2f} s beside {evo_s:.2f} s, {len(stamps)} poses"
     yield Measurement("score.cpu_ratio_evo", ratio, "x", 1.2, note=note)
 
 
-def _cpu_s(command: Sequence[str]) -> tuple[str, float]:
+def _cpu_s(command: Sequence[str], place: Mapping[str, str]) -> tuple[str, float]:
     """What a command prints, and the processor time of its process."""
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    printed = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    printed = subprocess.run(command, check=True, capture_output=True, text=True, env=place).stdout
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     return printed, after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 

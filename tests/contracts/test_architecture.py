@@ -140,8 +140,9 @@ def test_no_method_imports_another():
         "estimators.graph.smoother",
         "estimators.peers.kiss_icp",
     } <= set(METHODS)
+    carrier = "estimators.programs.external"  # to a method in a process of its own
     for method, path in METHODS.items():
-        others = set(METHODS) - {method}
+        others = set(METHODS) - {method, carrier}
         for name in imports(path):
             assert name not in others, f"{method} imports {name}"
 

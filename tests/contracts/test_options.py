@@ -83,6 +83,7 @@ DEFAULTS = {
     "GtsamIsam2": "d3a09e69",
     "Gyroscope": "819bc6ea",
     "IcpOdometry": "3cc15ca0",
+    "Karto": "e91bdba0",
     "KissIcp": "71303030",
     "Laser": "e752606f",
     "Lidar3D": "29cea5d0",
