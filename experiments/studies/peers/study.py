@@ -153,7 +153,7 @@ def _compared(rows: pd.DataFrame, place: str) -> pd.DataFrame:
         enough = len(able) >= MIN_UNITS
         differ = differing_pairs(able) if enough else set()
         for name in wide:
-            found = {"level" + place: name in able and {best, name} not in differ}
+            found: Row = {"level" + place: name in able and {best, name} not in differ}
             if not place:
                 ratio = log_ratio_interval(wide[name], wide[best])
                 found |= {"over_best": ratio.value, "low": ratio.low, "high": ratio.high}
