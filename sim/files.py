@@ -1,5 +1,6 @@
 """Writing files so that nothing half-written is ever read back."""
 
+import hashlib
 import os
 import secrets
 import stat
@@ -18,6 +19,21 @@ def require_file(path: Path) -> None:
     with suppress(OSError, ValueError):
         mode = path.stat().st_mode
         require(stat.S_ISREG(mode), f"{path}: not a file; name a file, or remove it")
+
+
+def sha256_of(path: Path) -> str:
+    """SHA-256 of a file.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read, or is not a file.
+    """
+    require_file(path)
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+    except OSError as error:
+        raise InputError(f"{path}: cannot read it ({error.strerror})") from error
 
 
 def read_head(path: Path) -> bytes:

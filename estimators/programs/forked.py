@@ -42,7 +42,7 @@ class Forked:
 
     def __init__(self, answer: Answer, preload: str) -> None:
         context, variables = multiprocessing.get_context("forkserver"), environment()
-        context.set_forkserver_preload([answer.__module__, preload])
+        context.set_forkserver_preload([answer.__module__, preload, "numba"])
         (asked, self.stdin), (self.stdout, answers), (self.stderr, complaints) = (
             context.Pipe(duplex=False) for _ in range(3)
         )

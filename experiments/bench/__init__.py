@@ -22,6 +22,7 @@ SUITES = {
     "compile": ("compile",),
     "growth": ("growth",),
     "external": ("external",),
+    "score": ("score",),
     "worlds": ("worlds",),
 }
 

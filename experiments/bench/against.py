@@ -38,7 +38,7 @@ _SURE = 0.02  # until the medians have this standard error, as a share,
 _ROUND_S = 20.0  # or this time is up
 _EXCEPTION = re.compile(r"[\w.]+(Error|Exception)\b")  # begins the last line of a traceback
 _LOCK = "requirements.lock"  # of the environment
-_WALL = ("compile", "external", "sweep", "sweep_scale")  # their children do the work
+_WALL = ("compile", "external", "score", "sweep", "sweep_scale")  # their children do the work
 _BENCH = """
 from experiments.bench import run_bench
 def answer(name):

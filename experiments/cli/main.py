@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import os
 import sys
 from collections.abc import Callable
@@ -115,7 +116,8 @@ def main() -> None:
             raise InputError(gone) from None
         _check_environment()
         try:
-            app(_own_first(sys.argv[1:]))
+            words = _own_first(sys.argv[1:])
+            _only_named(words)(words)
         finally:
             with suppress(ValueError):  # an estimator has closed it
                 sys.stdout.flush()
@@ -125,6 +127,16 @@ def main() -> None:
         if ended.code == _INTERRUPTED:  # Typer has caught the interrupt, which may hold a message
             exit_with(ended)
         raise
+
+
+def _only_named(words: list[str]) -> typer.Typer:
+    """The app with no command but the one that is named: Typer takes 2 ms to make each."""
+    named = [command for command in app.registered_commands if command.name in words]
+    if not named or words[0] in ("-h", "--help"):
+        return app
+    one = copy.copy(app)
+    one.registered_commands = named
+    return one
 
 
 def _check_environment() -> None:

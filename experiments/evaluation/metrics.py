@@ -18,6 +18,8 @@ _CHI2_3DOF = {50: 2.365973884375338, 90: 6.251388631170325, 95: 7.81472790325117
 CHI2_95_2DOF = 5.991464547107979  # 95 % quantile of chi-square with two degrees of freedom
 _SINGULAR = 1e-10  # least eigenvalue of a correlation matrix that can be trusted
 RPE_DISTANCES_M = (1.0, 10.0)
+_REMARKED_PAUSE_S = 1.0  # without a pose
+_SPARSE = 5.0  # times the longest step of the recording: a path that chooses its poses
 LONGEST_GAP_S = 0.25  # of the truth, over which it is interpolated
 # Belief extras that `score` reads, of estimators that have them
 SCORED_EXTRAS = ("dispersion_m", "registration_status", "associations")
@@ -44,6 +46,26 @@ def longest_pause_s(stamps: Array, start: float, end: float) -> float:
     """Longest time from start to end without a stamp, s; the stamps increase."""
     inside = stamps[(stamps > start) & (stamps < end)]
     return float(np.diff([start, *inside, end]).max(initial=0.0))
+
+
+def describe_pause(recording: Recording, stamps: Array) -> str:
+    """Say what a path leaves out, if it is much: whoever chooses its poses chooses what is scored.
+
+    It counts what can be scored: the time between the first and the last Frame with a truth.
+    """
+    frames = recording.frame_stamps
+    start, end, own_s = frames[0], frames[-1], float(np.diff(frames).max(initial=0.0))
+    if recording.truth is not None:
+        known = recording.truth.stamps
+        start, end = max(start, known[0]), min(end, known[-1])
+        own_s = max(own_s, float(np.diff(known).max(initial=0.0)))
+    pause_s = longest_pause_s(stamps, start, end)
+    usual_s = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
+    if pause_s > max(_REMARKED_PAUSE_S, own_s):
+        return f"no pose for {pause_s:.3g} s of the recording"
+    if usual_s > _SPARSE * own_s:
+        return f"a pose every {usual_s:.3g} s, where the recording allows one every {own_s:.3g} s"
+    return ""
 
 
 def position_errors_m(truth: Array, means: Array) -> Array:

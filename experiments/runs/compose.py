@@ -21,7 +21,6 @@ from omegaconf.errors import InterpolationKeyError, OmegaConfBaseException
 from experiments.runs import paths
 from experiments.runs.calibration import mean_slip, read_calibrations
 from experiments.runs.console import TRUSTING
-from experiments.runs.key import digest_of
 from experiments.runs.schema import (
     GROUPS,
     KEYS,
@@ -34,7 +33,7 @@ from experiments.runs.schema import (
 )
 from experiments.runs.targets import named_code
 from sim.errors import InputError, describe_unknown, require
-from sim.files import read_text, write_text
+from sim.files import read_text, sha256_of, write_text
 from sim.yaml_file import read_yaml
 
 _SEARCHED = "hydra.searchpath="
@@ -366,7 +365,7 @@ def name_study_files(overrides: Sequence[str]) -> tuple[list[str], dict[Path, Pa
             continue
         _check_option(path)  # what is wrong is said of the file, not of its copy
         text = read_text(path)
-        copies[path] = paths.results() / "cache" / "studies" / digest_of(path)[:16]
+        copies[path] = paths.results() / "cache" / "studies" / sha256_of(path)[:16]
         write_text(copies[path] / "study" / path.name, text)
         named.append(f"study={path.stem}")
     return named, copies

@@ -26,7 +26,7 @@ from experiments.evaluation.map_quality import landmark_errors
 from experiments.evaluation.metrics import (
     LONGEST_GAP_S,
     SCORED_EXTRAS,
-    longest_pause_s,
+    describe_pause,
     score,
     unused_share,
 )
@@ -46,9 +46,7 @@ from sim.team import Team
 
 _ADDED = ("stamps_scored", "stamps_left_out", "step_time_us")  # over the robots
 _STREAMS = 100  # of a run's filters
-REMARKED_PAUSE_S = 1.0  # without a pose
 WARNED_SHARE = 0.1  # of scans or sightings that were not used
-_SPARSE = 5.0  # times the longest step of the recording: a path that chooses its poses
 
 Streams = Callable[[int], np.random.Generator]
 Planted = Callable[[Estimator, int], AbstractContextManager[object]]
@@ -265,35 +263,13 @@ def status_of(recording: Recording, online: Estimate, revised: Estimate | None =
     for path in paths:
         if why := explain_unsound(path):
             return Status(Outcome.FAILED, "unsound", f"{path.kind}: {why}")
-    pauses = [status_of_pauses(recording, path.stamps) for path in paths]
-    worst = max(pauses, key=lambda status: status.code)
+    pause = next(filter(None, (describe_pause(recording, path.stamps) for path in paths)), "")
     if online.status == "ok":
-        return worst
+        return Status(Outcome.REMARK, GAP, pause) if pause else Status()
     unused = unused_share(online) or 0.0
     said = f"{100.0 * unused:.0f} % of scans or sightings not used" if unused > WARNED_SHARE else ""
-    detail = "; ".join(filter(None, [worst.detail, online.status, said]))
-    return Status(Outcome.REMARK, worst.code or "estimator", detail)
-
-
-def status_of_pauses(recording: Recording, stamps: Array) -> Status:
-    """Remark on a path that leaves out much: whoever chooses its poses chooses what is scored.
-
-    It counts what can be scored: the time between the first and the last Frame with a truth.
-    """
-    frames = recording.frame_stamps
-    start, end, own_s = frames[0], frames[-1], float(np.diff(frames).max(initial=0.0))
-    if recording.truth is not None:
-        known = recording.truth.stamps
-        start, end = max(start, known[0]), min(end, known[-1])
-        own_s = max(own_s, float(np.diff(known).max(initial=0.0)))
-    pause_s = longest_pause_s(stamps, start, end)
-    usual_s = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
-    if pause_s <= max(REMARKED_PAUSE_S, own_s):
-        if usual_s <= _SPARSE * own_s:
-            return Status()
-        sparse = f"a pose every {usual_s:.3g} s, where the recording allows one every {own_s:.3g} s"
-        return Status(Outcome.REMARK, GAP, sparse)
-    return Status(Outcome.REMARK, GAP, f"no pose for {pause_s:.3g} s of the recording")
+    detail = "; ".join(filter(None, [pause, online.status, said]))
+    return Status(Outcome.REMARK, GAP if pause else "estimator", detail)
 
 
 # The robots of a team

@@ -6,7 +6,6 @@ import dataclasses
 import functools
 import inspect
 import operator
-import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -147,14 +146,8 @@ class Experiment(Objects):
 
     @property
     def rows_folder(self) -> Path:
-        """Folder of the rows.
-
-        Raises
-        ------
-        InputError
-            If the name is not one word.
-        """
-        return rows_folder(self.config["name"])
+        """Folder of the rows."""
+        return paths.rows_folder(self.config["name"])
 
     @property
     def key(self) -> str:
@@ -328,12 +321,3 @@ class Experiment(Objects):
         # an option of the estimator says how the sensor is called
         named = ([settings.get(option, option) for option in need.split("|")] for need in needs)
         return [names for names in named if has.isdisjoint(names)]
-
-
-def rows_folder(name: Any) -> Path:
-    """Folder of rows of a name, which must be one word."""
-    require(
-        isinstance(name, str) and re.fullmatch(r"[\w.-]*\w", name),
-        f"name must be one word for a folder of results, such as slip_2, got {name!r}",
-    )
-    return paths.results() / "runs" / str(name)

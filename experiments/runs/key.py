@@ -12,26 +12,10 @@ from experiments.runs.columns import DEPENDENCIES
 from experiments.runs.row import Row
 from experiments.runs.schema import SIMULATED_KEYS, Config, Leaf, leaves
 from experiments.runs.version import code_version
-from sim.errors import InputError
-from sim.files import require_file
+from sim.files import sha256_of
 
 _NOT_IN_KEY = ("name", "picture", "recording")
 _TEAM_KEYS = ("size", "robots")  # of the key `team`, those that decide what is read
-
-
-def digest_of(path: Path) -> str:
-    """SHA-256 of a file.
-
-    Raises
-    ------
-    InputError
-        If it cannot be read, or is not a file.
-    """
-    require_file(path)
-    try:
-        return hashlib.sha256(path.read_bytes()).hexdigest()
-    except OSError as error:
-        raise InputError(f"{path}: cannot read it ({error.strerror})") from error
 
 
 def decides_recording(leaf: Leaf, *, from_file: bool) -> bool:
@@ -117,4 +101,4 @@ def _cell(value: Any) -> Any:
 def _read(config: Config) -> Any:
     """The recording's file by its bytes, wherever it lies; a function that makes one, as it is."""
     wanted = config["recording"]
-    return digest_of(Path(wanted)) if isinstance(wanted, str) else wanted
+    return sha256_of(Path(wanted)) if isinstance(wanted, str) else wanted

@@ -4,7 +4,9 @@ import itertools
 import os
 import re
 from pathlib import Path
+from typing import Any
 
+from sim.errors import require
 from sim.files import read_text
 
 TRUST = "ESTIMA_TRUST"  # set by --trust: data may name code
@@ -59,6 +61,21 @@ def about(file: Path) -> dict[str, str]:
 def results() -> Path:
     """Return the folder of results: `results` in the current folder, or $ESTIMA_RESULTS."""
     return Path.cwd() / (os.environ.get("ESTIMA_RESULTS") or "results")
+
+
+def rows_folder(name: Any) -> Path:
+    """Folder of rows of a name.
+
+    Raises
+    ------
+    InputError
+        If the name is not one word.
+    """
+    require(
+        isinstance(name, str) and re.fullmatch(r"[\w.-]*\w", name),
+        f"name must be one word for a folder of results, such as slip_2, got {name!r}",
+    )
+    return results() / "runs" / str(name)
 
 
 def short(path: Path) -> str:

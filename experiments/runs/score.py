@@ -15,6 +15,7 @@ from estimators.base import Estimate
 from experiments.evaluation.metrics import (
     RPE_DISTANCES_M,
     alignment,
+    describe_pause,
     heading_errors_rad,
     longest_pause_s,
     pairs_by_distance,
@@ -26,16 +27,15 @@ from experiments.evaluation.metrics import (
 from experiments.evaluation.relations import relation_scores
 from experiments.evaluation.time_sync import Rows, nearest_rows
 from experiments.runs.columns import OF_THE_RUN, REVISED
-from experiments.runs.evaluate import status_of_pauses
-from experiments.runs.experiment import rows_folder
-from experiments.runs.key import digest_of
-from experiments.runs.row import Outcome, Row, Status
+from experiments.runs.paths import rows_folder
+from experiments.runs.row import GAP, Outcome, Row, Status
 from experiments.runs.store import write_run
 from experiments.runs.version import code_version
 from experiments.trajectories.read import read_trajectory
 from sim import se2
 from sim.arrays import Array
 from sim.errors import InputError, require
+from sim.files import sha256_of
 from sim.formats.detect import read_any
 from sim.formats.relations import read_relations
 from sim.options import NonNegative, options
@@ -196,8 +196,10 @@ def row_of(
     checksum = recording.checksum
     origin = json.dumps([checksum, _digests_of(files[1]), settings, estimator])
     stamps = given.stamps + how.offset_s if scored is None else scored.estimate.stamps
-    status, seed = status_of_pauses(recording, stamps), recording.config.get("seed")
-    if status.outcome is Outcome.OK and given.left_out:
+    status, seed = Status(), recording.config.get("seed")
+    if pause := describe_pause(recording, stamps):
+        status = Status(Outcome.REMARK, GAP, pause)
+    elif given.left_out:
         status = Status(Outcome.REMARK, "planar", given.left_out)
     row: Row = {
         "choice.estimator": estimator,
@@ -333,4 +335,4 @@ def describe_scoring(scored: ScoredTrajectory, how: Scoring) -> str:
 def _digests_of(path: Path) -> list[str]:
     """Digests of a file, or of the files in a folder."""
     files = path.glob("*") if path.is_dir() else [path]
-    return sorted(digest_of(file) for file in files if file.is_file())
+    return sorted(sha256_of(file) for file in files if file.is_file())

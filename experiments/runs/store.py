@@ -299,15 +299,18 @@ def compact(path: Path) -> None:
 
 
 def write_run(rows: Sequence[Row], folder: Path) -> Path:
-    """Write the rows of a single run, in place of its former ones; return the file."""
+    """Write the rows of a single run, in place of its former ones; return the file.
+
+    It is a journal until a sweep makes Parquet of it: Arrow takes longer to load than all else.
+    """
     for row in rows:
         check_row(row)
-    key = str(rows[0]["run_key"])
-    former = set(folder.glob(f"{key}*.parquet"))
-    paths = [write_table(table, folder / key) for table in to_tables(rows)]
-    for path in former.difference(paths):
-        path.unlink(missing_ok=True)
-    return paths[0]
+    path = folder / f"{rows[0]['run_key']}{JOURNAL}"
+    with write_whole(path) as part, journal(part) as book:
+        book.append(rows)
+    for former in folder.glob(f"{path.stem}*.parquet"):
+        former.unlink(missing_ok=True)
+    return path
 
 
 def write_table(table: pa.Table, stem: Path) -> Path:

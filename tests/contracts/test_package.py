@@ -113,7 +113,7 @@ def test_run_options_and_version(installed):
     code, said = estima("run", *QUICK, "name=first")
     assert code == 0, said
     assert "position RMSE" in said
-    (row,) = (folder / "results" / "runs" / "first").glob("*.parquet")
+    (row,) = (folder / "results" / "runs" / "first").glob("*.journal")
     assert (row.parent / row.name.partition(".")[0] / "run.png").exists()
     assert "odometry" in estima("options")[1]
     assert estima("--version")[1].split() == ["estima", "0.2.0,", "code", code_version()]
@@ -124,7 +124,7 @@ def test_results_go_where_the_option_says(installed):
     for arguments in (("--results", "elsewhere", "run"), ("run", "--results=elsewhere")):
         code, said = estima(*arguments, *QUICK, "name=moved", f"seed={len(arguments)}")
         assert code == 0, said
-    assert len(list((folder / "elsewhere" / "runs" / "moved").glob("*.parquet"))) == 2
+    assert len(list((folder / "elsewhere" / "runs" / "moved").glob("*.journal"))) == 2
     assert not (folder / "results" / "runs" / "moved").exists()
 
 

@@ -18,7 +18,7 @@ from experiments.bench import SUITES
 from experiments.cli import main as cli
 from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
-from experiments.runs.row import read_rows
+from experiments.runs.store import read_runs
 from experiments.sweeps.collect import where
 from sim.errors import InputError
 from sim.team import Team
@@ -115,7 +115,7 @@ def test_a_run_prints_its_errors_and_leaves_a_row(tmp_path):
     done = estima("run", *QUICK, "seed=12", "name=test_cli", cwd=tmp_path, **place)
     assert done.returncode == 0, done.stderr
     assert "position RMSE" in done.stdout
-    frame = read_rows(next((tmp_path / "mine" / "runs" / "test_cli").glob("*.parquet")))
+    frame = read_runs(tmp_path / "mine" / "runs" / "test_cli")
     assert frame["status"].tolist() == ["ok"]
     assert frame["robot.kr"].tolist() == [1e-5]
     assert np.isfinite(frame["ate_rmse_m"]).all()

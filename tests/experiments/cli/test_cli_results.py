@@ -44,7 +44,7 @@ def test_results_go_to_the_folder_of_the_option(tmp_path, after):
     arguments = [*run, *option] if after else [*option, *run]
     done = estima(*arguments, cwd=tmp_path, ESTIMA_RESULTS="elsewhere")
     assert done.returncode == 0, done.stderr
-    assert len(list((tmp_path / "there" / "runs" / "moved").glob("*.parquet"))) == 1
+    assert len(list((tmp_path / "there" / "runs" / "moved").glob("*.journal"))) == 1
     assert [path.name for path in tmp_path.iterdir()] == ["there"]
 
 

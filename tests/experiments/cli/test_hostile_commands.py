@@ -293,12 +293,12 @@ def test_a_folder_that_is_gone_is_named(here, monkeypatch):
 
 
 def test_a_sparse_path_is_remarked():
-    from experiments.runs.evaluate import status_of_pauses
+    from experiments.evaluation.metrics import describe_pause
 
     recording = fakes.circle(n_frames=100)
     stamps = recording.frame_stamps
-    assert status_of_pauses(recording, stamps).code == ""
-    assert status_of_pauses(recording, stamps[::4]).code == ""
-    sparse = status_of_pauses(recording, stamps[::9])
-    assert sparse.detail.startswith("a pose every 0.9 s, where the recording allows")
+    assert describe_pause(recording, stamps) == ""
+    assert describe_pause(recording, stamps[::4]) == ""
+    sparse = describe_pause(recording, stamps[::9])
+    assert sparse.startswith("a pose every 0.9 s, where the recording allows")
     assert np.isfinite(stamps).all()
