@@ -13,8 +13,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
-if "numba" in sys.modules:  # else it comes later; results that use it depend on it all the same
-    pass
+if "numba" in sys.modules:  # else it comes later; what is compiled depends on it all the same
+    import numba as numba  # dependencies are found by imports outside functions
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -133,4 +133,8 @@ class _Compiled:
 
 def njit(**options: Any) -> Callable[[Function], Function]:
     """`numba.njit` with the compiled code cached on disk; the function keeps its type."""
-    return lambda function: cast(Function, _Compiled(function, options))
+
+    def compiled(function: Function) -> Function:
+        return cast(Function, _Compiled(function, options))
+
+    return compiled
