@@ -185,11 +185,18 @@ def _of_means(study: str, table: pd.DataFrame, composer: Composer) -> Iterable[J
 def _of_peers(study: str, table: pd.DataFrame, composer: Composer) -> Iterable[Judged]:
     compose = _settings_of(study, composer)
     worlds = [c.removeprefix("ate_rmse_m_") for c in table if c.startswith("ate_rmse_m_")]
-    for _, row in table.iterrows():
+    for _, row in _of_options(table).iterrows():
         for world in worlds:
             error, runs = float(row[f"ate_rmse_m_{world}"]), int(row["runs"]) // len(worlds)
-            setting = compose((("world", world),))
+            setting = compose((("study/board", world),))
             yield Judged(study, row["estimator"], setting, error, math.nan, math.nan, runs)
+
+
+def _of_options(table: pd.DataFrame) -> pd.DataFrame:
+    """A row an option of an estimator: of its best answer, with our information if that was run."""
+    able = table[table["competes"]]
+    order = able.assign(informed=able["arm"] == "informed").sort_values(["answer", "informed"])
+    return able.loc[order.drop_duplicates("estimator", keep="last").index]
 
 
 def _settings_of(
@@ -217,7 +224,7 @@ def seconds_a_frame() -> dict[str, float]:
     path = _table("peers")
     if not path.exists():
         return {}
-    table = read_rows(path)
+    table = _of_options(read_rows(path))
     return dict(zip(table["estimator"], table["cpu_time_us"] / 1e6, strict=True))
 
 

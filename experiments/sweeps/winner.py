@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -108,7 +109,7 @@ def find_winner(table: pd.DataFrame) -> Winner | None:
         return None
     means = np.exp(np.log(errors).mean()).sort_values()
     best = str(means.index[0])
-    differ = _differing(errors) if len(errors) >= MIN_UNITS else set()
+    differ = differing_pairs(errors) if len(errors) >= MIN_UNITS else set()
     rivals = [
         _rival(str(name), errors[name], errors[best], {best, str(name)} in differ)
         for name in means.index[1:]
@@ -116,7 +117,7 @@ def find_winner(table: pd.DataFrame) -> Winner | None:
     return Winner(best, float(means.iloc[0]), len(errors), tuple(rivals), tuple(out))
 
 
-def _differing(errors: pd.DataFrame) -> set[frozenset[str]]:
+def differing_pairs(errors: pd.DataFrame) -> set[frozenset[Any]]:
     """Pairs of arms that differ; all are tested, since the best is chosen by the same data."""
     pairs = list(combinations(errors, 2))
     p = [difference_p(errors[first], errors[second], ERROR) for first, second in pairs]

@@ -1,4 +1,4 @@
-"""Figures of the study of peers: errors and processor times."""
+"""Figure of the study of peers: errors by class of world, with intervals and ties."""
 
 import numpy as np
 import pandas as pd
@@ -6,11 +6,13 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from experiments.judging.results import Results
-from experiments.studies.peers.settings import LASER, MAP, STEREO, TUNED
+from experiments.studies.peers.settings import CLASSES, LASER, MAP, STEREO, TUNED
+from experiments.studies.peers.study import is_ours
 from experiments.viewing.plotting import set_axes
 from experiments.viewing.style import BLUE, ORANGE, WALL, subplots
 
-_WORLDS = {"room": "s", "rooms": "^", "office": "D"}
+_BOARDS = [(s, a) for s in (LASER, MAP, STEREO) for a in ("online", "revised")]
+_PLACES = {"all classes": "", **{name: f"_{name}" for name in CLASSES}}
 
 
 def draw(results: Results) -> dict[str, Figure]:
@@ -19,57 +21,59 @@ def draw(results: Results) -> dict[str, Figure]:
 
 
 def errors(methods: pd.DataFrame) -> Figure:
-    """Draw the error of each method, the best on top, with its processor time beside it."""
-    groups = [sensor for sensor in (LASER, MAP, STEREO) if (methods["sensor"] == sensor).any()]
-    parts = {sensor: methods[methods["sensor"] == sensor] for sensor in groups}
-    heights = [len(part) for part in parts.values()]
+    """Draw the error of each method that competes by class, the best over all classes on top."""
+    able = methods[methods["competes"]]
+    parts = {b: able[(able["sensor"] == b[0]) & (able["answer"] == b[1])] for b in _BOARDS}
+    parts = {board: part for board, part in parts.items() if len(part)}
+    heights = [len(part) + 1 for part in parts.values()]
     page, rows = subplots(
-        9.5,
-        0.7 + 0.5 * len(parts) + 0.3 * sum(heights),
+        13.0,
+        1.0 + 0.3 * len(parts) + 0.22 * sum(heights),
         len(parts),
-        2,
+        len(_PLACES),
         gridspec_kw={"height_ratios": heights},
         squeeze=False,
+        sharex=True,
     )
-    for (sensor, part), (left, right) in zip(parts.items(), rows, strict=True):
-        names = list(part["estimator"])
-        places = np.arange(len(names))[::-1]
-        for place, (_, method) in zip(places, part.iterrows(), strict=True):
-            color = BLUE if method["project"] == "Estima" else ORANGE
-            filled = color if method["tuned"] else "white"
-            mark = {"color": color, "mfc": filled, "ls": "", "zorder": 2}
-            for world, shape in _WORLDS.items():
-                error_m = method[f"ate_rmse_m_{world}"]
-                left.plot(error_m, place, shape, ms=5, color=WALL, mec="white", mew=0.5, zorder=3)
-            left.plot(method["ate_rmse_m"], place, "o", ms=8, **mark)
-            right.plot(method["cpu_time_us"], place, "o", ms=8, **mark)
-        for axes, label in ((left, "RMS position error, m"), (right, "processor time a Frame, µs")):
-            set_axes(axes, plain="x", xlabel=label, ylim=(-0.7, len(names) - 0.3))
+    for (board, part), line in zip(parts.items(), rows, strict=True):
+        at = np.arange(len(part))[::-1]
+        for axes, (title, place) in zip(line, _PLACES.items(), strict=True):
+            for y, (_, row) in zip(at, part.iterrows(), strict=True):
+                value, low, high = (row[f"{c}{place}"] for c in ("ate_rmse_m", *_ENDS))
+                colour = BLUE if is_ours(row["estimator"]) else ORANGE
+                filled = colour if row[f"level{place}"] else "white"
+                axes.plot([low, high], [y, y], color=colour, lw=1.2)
+                axes.plot(value, y, "o", ms=5, color=colour, mfc=filled)
+            set_axes(axes, xscale="log", ylim=(-0.7, len(part) - 0.3))
             axes.grid(axis="y", color="0.92")
-        right.tick_params(axis="y", length=0)
-        left.set_yticks(places, list(map(_label, names, part["answer"])))
-        right.set_yticks(places, [""] * len(names))
-        left.set_title(f"{sensor} and wheels", fontsize=9, loc="left")
+            axes.tick_params(axis="y", length=0)
+            axes.set_yticks(at, [""] * len(part))
+            axes.set_title(title if line is rows[0] else "", fontsize=9)
+        line[0].set_yticks(at, [_label(row) for _, row in part.iterrows()], fontsize=7)
+        line[0].set_ylabel(f"{board[0]},\n{board[1]}", fontsize=8)
+    page.supxlabel("RMS position error, m", fontsize=9)
     page.legend(handles=_legend(), loc="outside lower center", ncols=4, fontsize=8)
     return page
 
 
-def _label(name: str, answer: str) -> str:
-    """A method's name with what is said of it: whether it is tuned, and revised."""
-    said = {"tuned": name.endswith(TUNED), "revised": answer == "revised"}
-    marks = ", ".join(mark for mark, holds in said.items() if holds)
-    return name.removesuffix(TUNED) + (f" ({marks})" if marks else "")
+_ENDS = ("ate_low_m", "ate_high_m")
+
+
+def _label(row: "pd.Series[str]") -> str:
+    """A method with its arm, and a mark if it is given a map."""
+    arm = f", {row['arm']}" if not is_ours(row["estimator"]) else ""
+    mapped = " (map)" if row["sensor"] == MAP else ""
+    return f"{row['estimator'].removesuffix(TUNED)}{arm}{mapped}"
 
 
 def _legend() -> list[Line2D]:
-    """One entry a colour, a filling and a world."""
+    """One entry a colour and a filling."""
     return [
-        Line2D([], [], color=color, mfc=filled, ls="", marker=shape, ms=size, label=label)
-        for label, color, filled, shape, size in [
-            ("ours", BLUE, BLUE, "o", 7),
-            ("of another project", ORANGE, ORANGE, "o", 7),
-            ("default", "black", "white", "o", 7),
-            ("tuned", "black", "black", "o", 7),
-            *((world, WALL, WALL, shape, 4) for world, shape in _WORLDS.items()),
+        Line2D([], [], color=color, mfc=filled, ls="", marker="o", ms=6, label=label)
+        for label, color, filled in [
+            ("ours", BLUE, BLUE),
+            ("another project's", ORANGE, ORANGE),
+            ("level with the best of its board", WALL, WALL),
+            ("worse (Holm over all pairs)", WALL, "white"),
         ]
     ]

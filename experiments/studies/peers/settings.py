@@ -1,11 +1,14 @@
 """What the study shows of each method; the runs are in conf/study/peers.yaml."""
 
+CLASSES = ("rooms", "office", "curved", "clutter", "people", "changed")
 TUNED = "_tuned"  # ends the name of an option that `estima tune peers` wrote
+COMPETING = ("shipped", "informed", "tuned")  # arms; others have wrong beliefs, and stand beside
 # Package of each peer, whose version the table gives; what is not here is ours.
 PACKAGES = {
     "small_gicp": "small_gicp",
     "small_gicp_keyframe": "small_gicp",
     "kiss_icp": "kiss-icp",
+    "kiss_icp_wheels": "kiss-icp",
     "gtsam_isam2": "gtsam",
     "gtsam_batch": "gtsam",
     "mrpt_icp": "mrpt",

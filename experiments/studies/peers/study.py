@@ -1,4 +1,4 @@
-"""Methods of other projects beside ours: errors and processor times on the same recordings."""
+"""Methods of other projects beside ours, on the same drives through six classes of world."""
 
 import importlib.metadata
 import subprocess
@@ -8,19 +8,26 @@ import pandas as pd
 
 from estimators.peers import MissingPackageError
 from experiments.evaluation.statistics import log_ratio_interval
-from experiments.judging.jobs import Progress, Tables, answer_of, group_by, tables_of
-from experiments.judging.remake import Cells, Remake, agrees
+from experiments.judging.jobs import Progress, Tables, group_by, tables_of
+from experiments.judging.remake import Cells, Remake
 from experiments.judging.results import Profile, Results
+from experiments.runs.columns import REVISED
 from experiments.runs.compose import find_option
 from experiments.runs.console import warn
+from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Outcome, Row
-from experiments.studies.peers.settings import LASER, PACKAGES, READS, TUNED
+from experiments.studies.peers.settings import CLASSES, COMPETING, LASER, PACKAGES, READS, TUNED
+from experiments.sweeps.averages import MIN_UNITS, averages
 from experiments.sweeps.plan import plan_experiments
 from experiments.sweeps.tune import FAILED_M
+from experiments.sweeps.winner import differing_pairs
 
-_ERROR = "answer_ate_rmse_m"
-_KEPT = ("status", "answer", _ERROR, "answer_heading_rmse_rad", "cpu_time_us")
+_ERROR = "ate_rmse_m"
+_SCORES = (_ERROR, "heading_rmse_rad", "nees_mean", "unused_share")
+_METHOD = ["sensor", "answer", "estimator", "arm"]
+_DRIVE = ["board", "seed"]
+_EXPECTED_NEES = 3.0  # of a planar pose
 
 
 def run(profile: Profile, out: Results, on_progress: Progress) -> None:
@@ -29,7 +36,7 @@ def run(profile: Profile, out: Results, on_progress: Progress) -> None:
     Parameters
     ----------
     profile
-        `quick`: one recording of each world; `full`: five.
+        `quick`: one drive of each class; `full`: all of the study's YAML.
     """
     fewer = [] if profile is Profile.FULL else ["seed=1000"]
     experiments = list(plan_experiments(["study=peers", *fewer]))
@@ -38,7 +45,7 @@ def run(profile: Profile, out: Results, on_progress: Progress) -> None:
     for name, reason in absent.items():
         warn(f"{name}: left out, {reason}")
     present = [e for e in experiments if e.estimator_name not in absent]
-    drives = group_by(present, lambda e: (e.choices["world"], e.seed))
+    drives = group_by(present, lambda e: (e.label("board"), e.seed))
     made = tables_of(runs, [(drive,) for drive in drives], on_progress)
     out.write_tables(**made, methods=methods(made["runs"]))
     if absent:
@@ -52,9 +59,9 @@ REMADE = {"runs": 8.0}  # methods are means of them
 def remake(_table: str, row: Cells) -> Remake | None:
     """The call that makes a row again; None if its method is not here."""
     option = find_option("estimator", row["estimator"])
-    given = ["study=peers", f"seed={row['seed']:.0f}", f"estimator={option}"]
-    for one in plan_experiments(given):
-        if agrees(row, {name: one.choices[name] for name in ("world", "estimator")}):
+    given = [f"study/board={row['board']}", f"seed={row['seed']:.0f}", f"estimator={option}"]
+    for one in plan_experiments(["study=peers", *given]):
+        if (one.label("arm"), one.estimator_name) == (row["arm"], row["estimator"]):
             return None if missing(one) else (runs, ([one],))
     return None
 
@@ -75,56 +82,91 @@ def missing(experiment: Experiment) -> str:
 
 
 def runs(drive: list[Experiment]) -> Tables:
-    """Rows of all methods on one recording."""
-    rows: list[Row] = [
-        {
-            "world": one.choices["world"],
-            "seed": one.seed,
-            "estimator": one.estimator_name,
-            **answer_of(one, _KEPT),
-        }
-        for one in drive
-    ]
+    """Rows of all methods on one drive; of a method that revises its path, one an answer."""
+    rows = [row for one in drive for row in _answers(one)]
     return {"runs": rows}
 
 
-def methods(table: pd.DataFrame) -> pd.DataFrame:
-    """A row a method, the best first among those of its sensor.
+def _answers(one: Experiment) -> list[Row]:
+    found = evaluate(one)[0]
+    revised = REVISED + _ERROR in found
+    return [
+        {
+            "board": one.label("board"),
+            "seed": one.seed,
+            "estimator": one.estimator_name,
+            "arm": one.label("arm"),
+            "answer": "revised" if prefix else "online",
+            "status": found["status"],
+            **{name: found.get(prefix + name, np.nan) for name in _SCORES},
+            "cpu_time_us": found.get("cpu_time_us", np.nan),
+        }
+        for prefix in ("", *[REVISED] * revised)
+    ]
 
-    Errors are geometric means over the recordings, a failed run counting as 100 m; `over_best_ours`
-    is the paired ratio to the best of ours for that sensor with its 95 % interval.
+
+def methods(table: pd.DataFrame) -> pd.DataFrame:
+    """A row a method, arm and answer, the best first among those of its sensor and answer.
+
+    Errors are geometric means over the drives, a failed run counting as 100 m. `level` says
+    whether it is the best of its board or does not differ from that by paired t tests of the logs,
+    with Holm's method over all pairs of the arms that compete; `level_CLASS` the same on the drives
+    of a class. `over_best` is the paired ratio to the best, with its 95 % interval.
     """
-    errors_m = table[_ERROR].astype(float)
-    failed = (table["status"] == Outcome.FAILED) | ~np.isfinite(errors_m)
-    kept = table.assign(e=errors_m.where(~failed, FAILED_M))
-    wide = kept.pivot(index=["world", "seed"], columns="estimator", values="e")
-    means_m = np.exp(np.log(wide).mean())
-    by_world = np.exp(np.log(wide).groupby("world").mean())
-    times = table.groupby("estimator")["cpu_time_us"].median()
-    rows = []
-    for name in wide:
-        sensor = sensor_of(name)
-        ours = [other for other in wide if is_ours(other) and sensor_of(other) == sensor]
-        ratio = log_ratio_interval(wide[name], wide[min(ours, key=lambda o: means_m[o])])
-        mine = table["estimator"] == name
-        rows.append(
-            {
-                "sensor": sensor,
-                "estimator": name,
-                "tuned": name.endswith(TUNED),
-                "project": version_of(name),
-                "answer": "/".join(sorted(set(table.loc[mine, "answer"].dropna()))),
-                "runs": int(mine.sum()),
-                "failed": int((mine & failed).sum()),
-                "ate_rmse_m": means_m[name],
-                **{f"ate_rmse_m_{world}": row[name] for world, row in by_world.iterrows()},
-                "over_best_ours": ratio.value,
-                "low": ratio.low,
-                "high": ratio.high,
-                "cpu_time_us": times[name],
-            }
-        )
-    return pd.DataFrame(rows).sort_values(["sensor", "ate_rmse_m"], ignore_index=True)
+    failed = (table["status"] == Outcome.FAILED) | ~np.isfinite(table[_ERROR].astype(float))
+    kept = table.assign(
+        sensor=[sensor_of(name) for name in table["estimator"]],
+        failed=failed,
+        **{_ERROR: table[_ERROR].astype(float).where(~failed, FAILED_M)},
+        drive=table["board"] + "/" + table["seed"].astype(str),
+    )
+    found = kept.groupby(_METHOD).agg(
+        runs=("status", "size"),
+        failed=("failed", "sum"),
+        heading_rmse_rad=("heading_rmse_rad", _geometric),
+        nees_over_3=("nees_mean", lambda v: v.mean() / _EXPECTED_NEES),
+        used_share=("unused_share", lambda v: 1.0 - v.mean()),
+        cpu_time_us=("cpu_time_us", "median"),
+    )
+    for place, rows in {"": kept, **{f"_{c}": kept[kept["board"] == c] for c in CLASSES}}.items():
+        means = averages(rows, _METHOD, "drive", _ERROR)
+        names = {"value": _ERROR, "low": "ate_low_m", "high": "ate_high_m"}
+        found = found.join(means.rename(columns={k: v + place for k, v in names.items()}))
+        found = found.join(_compared(rows, place))
+    found = found.reset_index().sort_values(["sensor", "answer", _ERROR], ignore_index=True)
+    found.insert(4, "project", [version_of(name) for name in found["estimator"]])
+    return found.assign(competes=found["arm"].isin(COMPETING))
+
+
+def _geometric(values: "pd.Series[float]") -> float:
+    known = values.dropna()
+    return float(np.exp(np.log(known).mean())) if len(known) else np.nan
+
+
+def _compared(rows: pd.DataFrame, place: str) -> pd.DataFrame:
+    """Each method beside the best of its board: whether it is level, and over all the ratio."""
+    parts = []
+    for board, part in rows.groupby(["sensor", "answer"]):
+        wide = part.pivot(index="drive", columns=["estimator", "arm"], values=_ERROR)
+        able = wide[[name for name in wide if name[1] in COMPETING]]
+        best = np.log(able).mean().idxmin()
+        enough = len(able) >= MIN_UNITS
+        differ = differing_pairs(able) if enough else set()
+        for name in wide:
+            found: Row = {"level" + place: name in able and {best, name} not in differ}
+            if not place:
+                ratio = log_ratio_interval(wide[name], wide[best])
+                found |= {"over_best": ratio.value, "low": ratio.low, "high": ratio.high}
+            parts.append({**dict(zip(_METHOD, (*board, *name), strict=True)), **found})
+    return pd.DataFrame(parts).set_index(_METHOD)
+
+
+def best_where(found: pd.DataFrame, sensor: str, answer: str) -> dict[str, list[str]]:
+    """Methods, with their arms, that are level with the best: over all (`""`), and by class."""
+    part = found[(found["sensor"] == sensor) & (found["answer"] == answer) & found["competes"]]
+    places = {"": "level", **{name: f"level_{name}" for name in CLASSES}}
+    named = part["estimator"].str.removesuffix(TUNED) + " (" + part["arm"] + ")"
+    return {place: list(named[part[column].astype(bool)]) for place, column in places.items()}
 
 
 def sensor_of(name: str) -> str:

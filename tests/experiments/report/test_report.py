@@ -429,7 +429,7 @@ def test_a_tuned_method_is_no_second_one_and_ties_are_said(tmp_path):
     path = tmp_path / "peers_methods.csv"
     rows = {"sensor": "laser", "estimator": ["a", "a_tuned", "b_tuned", "b", "c"], "runs": 15}
     rows |= {"project": "Estima", "ate_rmse_m": [0.01, 0.01, 0.011, 0.011, 0.02]}
-    rows |= {"over_best_ours": [1, 1, 1.1, 1.1, 2.0], "answer": "online"}
+    rows |= {"over_best": [1, 1, 1.1, 1.1, 2.0], "answer": "online"}
     rows |= {"low": [1, 1, 0.9, 0.9, 1.5], "high": [1, 1, 1.3, 1.3, 3.0]}
     write_frame(pd.DataFrame(rows), path)
     shown = leaderboard.on_lasers(path)["rows"]
