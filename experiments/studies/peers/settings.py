@@ -11,6 +11,7 @@ PACKAGES = {
     "kiss_icp_wheels": "kiss-icp",
     "gtsam_isam2": "gtsam",
     "gtsam_batch": "gtsam",
+    "karto": "karto-scanmatcher",
     "mrpt_icp": "mrpt",
     "mrpt_mcl": "mrpt",
     "mrpt_rbpf": "mrpt",

@@ -113,6 +113,7 @@ def methods(table: pd.DataFrame) -> pd.DataFrame:
     with Holm's method over all pairs of the arms that compete; `level_CLASS` the same on the drives
     of a class. `over_best` is the paired ratio to the best, with its 95 % interval.
     """
+    table = _complete(table)
     failed = (table["status"] == Outcome.FAILED) | ~np.isfinite(table[_ERROR].astype(float))
     kept = table.assign(
         sensor=[sensor_of(name) for name in table["estimator"]],
@@ -136,6 +137,14 @@ def methods(table: pd.DataFrame) -> pd.DataFrame:
     found = found.reset_index().sort_values(["sensor", "answer", _ERROR], ignore_index=True)
     found.insert(4, "project", [version_of(name) for name in found["estimator"]])
     return found.assign(competes=found["arm"].isin(COMPETING))
+
+
+def _complete(table: pd.DataFrame) -> pd.DataFrame:
+    """The rows, with a failed one where a run that failed has no revised answer."""
+    given, drives = (table[c].drop_duplicates() for c in (["estimator", "arm", "answer"], _DRIVE))
+    return (
+        given.merge(drives, how="cross").merge(table, how="left").fillna({"status": Outcome.FAILED})
+    )
 
 
 def _geometric(values: "pd.Series[float]") -> float:

@@ -97,6 +97,15 @@ def test_a_failed_run_counts_as_a_large_error():
     assert found["ate_rmse_m"] == pytest.approx(math.exp(logs.mean()))
 
 
+def test_a_failed_run_has_no_revised_row_and_counts_all_the_same():
+    table = runs()
+    revised = table.index[table["estimator"] == "gtsam_batch"]
+    found = study.methods(table.drop(revised[0])).set_index("estimator").loc["gtsam_batch"]
+    assert (found["runs"], found["failed"]) == (24, 1)
+    logs = np.log(np.append(table.loc[revised[1:], "ate_rmse_m"], 100))
+    assert found["ate_rmse_m"] == pytest.approx(math.exp(logs.mean()))
+
+
 def test_its_figure(tmp_path):
     made = Results(tmp_path, "peers")
     made.write_tables(methods=study.methods(runs()))
