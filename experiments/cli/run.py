@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -69,9 +69,15 @@ def run(
         arguments = ["study=first_run"]
         print("estima run study=first_run (estima options lists what else there is)")
     from experiments.cli.arguments import run_arguments
+
+    run_arguments(arguments, _draw, out)
+
+
+def _draw(*run: Any) -> None:
+    """Write a run's picture; Matplotlib, which takes a second to import, is needed for it alone."""
     from experiments.viewing.run_figure import draw_run
 
-    run_arguments(arguments, draw_run, out)
+    draw_run(*run)
 
 
 def record(
