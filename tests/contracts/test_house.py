@@ -186,7 +186,7 @@ def speaks(tree):
 # Modules below cli that print or name flags: the console itself, a script of its own (power), a
 # bench of the command line, and those that show commands. Nothing is added; what is mended leaves.
 SPEAKING = {
-    "bench/score.py", "bench/sweep.py", "gate/power.py", "gate/report.py", "judging/results.py",
+    "bench/sweep.py", "gate/power.py", "gate/report.py", "judging/results.py",
     "report/contents.py", "runs/console.py", "sweeps/commands.py",
 }  # fmt: skip
 
