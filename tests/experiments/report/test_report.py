@@ -143,7 +143,10 @@ def test_each_claim_is_one_row_with_its_statistics_below(text):
     assert "The ellipse holds <b>61 %</b> at 1e-3 m." in head
     verdict, figures = head.strip().split("Figures: ")
     assert verdict.endswith("not reproduced (quick)")
-    assert figures == "Coverage of the 95 % ellipse"
+    figures, asked = figures.split("It holds if all these do.")
+    assert figures.strip() == "Coverage of the 95 % ellipse"
+    assert "the unfavourable" in asked
+    assert "of our own" not in asked
     assert folded.index("the unfavourable") < folded.index("of our own")  # headlines first
     assert "0.250 [0.400, 0.600]" in folded
     assert "follows from its headline statistics" in page.all("caption")[0]["text"]
