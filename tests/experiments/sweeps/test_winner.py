@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 
 from experiments.evaluation.statistics import paired_p
-from experiments.sweeps.winner import _differing, find_winner
+from experiments.sweeps.winner import differing_pairs, find_winner
 
 
 def rows(errors, worlds=("office",), **columns):
@@ -92,5 +92,5 @@ def test_false_alarms_among_equals_are_held():
         drives = rng.lognormal(0.0, 0.5, 8)
         errors = pd.DataFrame({name: drives * rng.lognormal(0.0, 0.1, 8) for name in "abcd"})
         best = np.log(errors).mean().idxmin()
-        wrong += any(best in pair for pair in _differing(errors))
+        wrong += any(best in pair for pair in differing_pairs(errors))
     assert wrong / n < 0.05 + 2.0 * (0.05 * 0.95 / n) ** 0.5  # though the data choose the best
