@@ -35,23 +35,27 @@ def errors(methods: pd.DataFrame) -> Figure:
         squeeze=False,
         sharex=True,
     )
+    errors_m = able[[f"ate_rmse_m{place}" for place in _PLACES.values()]]
+    limits = (errors_m.min(axis=None) / 3.0, errors_m.max(axis=None) * 3.0)
+    for axes, title in zip(rows[0], _PLACES, strict=True):
+        axes.set_title(title, fontsize=9)
     for (board, part), line in zip(parts.items(), rows, strict=True):
         at = np.arange(len(part))[::-1]
-        for axes, (title, place) in zip(line, _PLACES.items(), strict=True):
+        for axes, place in zip(line, _PLACES.values(), strict=True):
             for y, (_, row) in zip(at, part.iterrows(), strict=True):
                 value, low, high = (row[f"{c}{place}"] for c in ("ate_rmse_m", *_ENDS))
                 colour = BLUE if is_ours(row["estimator"]) else ORANGE
                 filled = colour if row[f"level{place}"] else "white"
                 axes.plot([low, high], [y, y], color=colour, lw=1.2)
                 axes.plot(value, y, "o", ms=5, color=colour, mfc=filled)
-            set_axes(axes, xscale="log", ylim=(-0.7, len(part) - 0.3))
+            set_axes(axes, xscale="log", xlim=limits, ylim=(-0.7, len(part) - 0.3))
             axes.grid(axis="y", color="0.92")
             axes.tick_params(axis="y", length=0)
             axes.set_yticks(at, [""] * len(part))
-            axes.set_title(title if line is rows[0] else "", fontsize=9)
         line[0].set_yticks(at, [_label(row) for _, row in part.iterrows()], fontsize=7)
         line[0].set_ylabel(f"{board[0]},\n{board[1]}", fontsize=8)
-    page.supxlabel("RMS position error, m", fontsize=9)
+    for axes in rows[-1]:
+        axes.set_xlabel("position RMSE, m", fontsize=8)
     page.legend(handles=_legend(), loc="outside lower center", ncols=4, fontsize=8)
     return page
 

@@ -1,6 +1,7 @@
 """The study of peers: its table, its figure, and what it does without a peer."""
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -14,6 +15,7 @@ from experiments.studies.peers import figures, study
 from experiments.studies.peers.settings import CLASSES
 from experiments.studies.peers.study import is_ours
 
+ROOT = Path(__file__).resolve().parents[3]
 ARMS = {  # error by estimator and arm, m
     ("odometry", "informed"): 1.0,
     ("ekf_icp", "informed"): 0.02,
@@ -143,3 +145,36 @@ def test_it_runs_when_named_and_leaves_the_tuning_alone(tmp_path, monkeypatch):
     assert reproduce.reproduce_paper("peers", Profile.QUICK) == []
     assert (tmp_path / "figures" / "peers_errors.png").exists()
     assert kept.exists()
+
+
+def test_the_comparison_says_what_the_table_has():
+    table = pd.read_csv(ROOT / "results" / "tables" / "peers_methods.csv")
+    text = " ".join((ROOT / "docs" / "programs.md").read_text(encoding="utf-8").split())
+    of = table[table["answer"] == "online"].set_index(["sensor", "estimator", "arm"])
+    for key, digits in {
+        ("laser", "small_gicp_keyframe_tuned", "tuned"): 1,
+        ("laser", "kiss_icp_tuned", "tuned"): 1,
+        ("laser", "ekf_icp", "slip a tenth"): 0,
+        ("laser", "ekf_icp", "slip tenfold"): 1,
+        ("laser, known map", "mcl", "informed"): 1,
+    }.items():
+        value, low, high = (
+            f"{of.loc[key, name]:.{digits}f}" for name in ("over_best", "low", "high")
+        )
+        assert f"{value} [{low}, {high}] times" in text or f"{value} [{low}, {high}]." in text, key
+    lasers = of.loc["laser"]
+    assert list(lasers.index[lasers["level"]]) == [
+        (n, "informed") for n in ("ekf_icp", "graph_slam")
+    ]
+    worse = lasers[lasers["ate_rmse_m"] > lasers.loc[("ekf_icp", "slip a tenth"), "ate_rmse_m"]]
+    assert {name for name, _ in worse.index} == {"small_gicp"}
+    ours, theirs = (of.loc[("laser, known map", *key)] for key in
+                    (("mcl", "informed"), ("mrpt_mcl_tuned", "tuned")))  # fmt: skip
+    assert (
+        f"{ours['heading_rmse_rad'] / theirs['heading_rmse_rad']:.1f} times its heading error"
+        in text
+    )
+    assert round(theirs["cpu_time_us"] / ours["cpu_time_us"]) == 6
+    assert ours["ate_rmse_m_changed"] < theirs["ate_rmse_m_changed"]
+    known = table[table["sensor"] == "landmarks"].set_index(["answer", "estimator", "arm"])
+    assert known.loc[("revised", "gtsam_batch", "informed"), "failed"] == 1
