@@ -345,6 +345,8 @@ def _command_digests(program: str, words: tuple[str, ...], folder: str | None) -
     if os.sep not in program and (path := shutil.which(program)):
         found[f"program {program}"] = digest_of(Path(path))
     for word in (program, *words):
+        if word == sys.executable:  # it lies elsewhere on each machine
+            continue
         with suppress(OSError, ValueError):
             if (os.sep in word or Path(word).suffix) and (where / word).is_file():
                 found[name_of((where / word).absolute())] = digest_of(where / word)

@@ -9,7 +9,7 @@ import pytest
 from experiments.runs import store
 from experiments.runs.dependencies import digests, recorder, sources
 from experiments.runs.dependencies.digests import changed
-from experiments.runs.dependencies.recorder import digest_of_all, recorded
+from experiments.runs.dependencies.recorder import _command_digests, digest_of_all, recorded
 from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
 from experiments.runs.paths import SOURCE
@@ -262,3 +262,9 @@ def test_what_was_damaged_is_not_believed(tmp_path):
     assert digests.package_version("rows_never_imported") is None
     assert digests.present_digest("/dev/zero") is None
     assert digests.present_digest("package ../x") is None
+
+
+def test_the_interpreter_of_a_command_is_not_a_file_it_depends_on(tmp_path):
+    script = tmp_path / "method.py"
+    script.write_text("")
+    assert list(_command_digests(sys.executable, (str(script),), None)) == [str(script)]
