@@ -82,7 +82,8 @@ def test_each_command_and_estimator_has_its_place(site):
     mcl = (site[0] / "reference" / "estimators" / "mcl" / "index.html").read_text()
     for option in described(Mcl):
         assert f"estimator.{option.name}<" in mcl
-    assert "mcl_tuned" in mcl.partition("On the boards")[2]
+    peer = (site[0] / "reference" / "estimators" / "peers_kiss_icp" / "index.html").read_text()
+    assert "kiss_icp_tuned" in peer.partition("On the boards")[2]
 
 
 def test_each_key_is_in_the_reference(site):
