@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -43,7 +43,7 @@ def sample_scenes(
     world: World, place: str, mount: Array, rng: np.random.Generator, n: int
 ) -> list[ScanScene]:
     """Poses of the laser along the world's tour inside a place, 5 cm and up to 3 degrees apart."""
-    path = _resampled(world.waypoints, 0.1)
+    path = resample(world.waypoints, 0.1)
     inside = np.flatnonzero(world.place_of(path[:, :2]) == place)
     found: list[ScanScene] = []
     turn_rad = math.radians(3.0)
@@ -64,6 +64,7 @@ def measure(
     n_sampled: int,
     metrics: Sequence[Metric] = METRICS,
     rules: Rules = DEFAULT_RULES,
+    methods: Collection[str] | None = None,
 ) -> pd.DataFrame:
     """Rows (metric x method): NEES over dof, determinants, errors, bias along the motion, times.
 
@@ -71,6 +72,8 @@ def measure(
     ----------
     n_repeats, n_sampled
         Pairs of noisy scans; how many of those that register have the covariance by sampling too.
+    methods
+        Of the covariances; None for all.
     """
     bearings, sigma = laser.bearings_rad, laser.sigma_range_m
     truth = se2.between(scene.T_w_target, scene.T_w_source)
@@ -94,6 +97,8 @@ def measure(
             if found.status in ("empty", "poor_overlap", "not_converged"):
                 continue
             for name, method in _methods(sigma, rng).items():
+                if methods is not None and name not in methods:
+                    continue
                 if name == "sampling" and len(tried.get((metric, name), ())) == n_sampled:
                     continue
                 begun = time.perf_counter()
@@ -227,7 +232,7 @@ def _nees_share(error: Array, covariance: Array, found: Registration) -> float:
     return float(part @ np.linalg.solve(rows @ covariance @ rows.T, part)) / len(rows)
 
 
-def _resampled(waypoints: Array, spacing_m: float) -> Array:
+def resample(waypoints: Array, spacing_m: float) -> Array:
     """Poses (N, 3) along a polyline, facing along it."""
     legs = []
     for start, way in zip(waypoints, np.diff(waypoints, axis=0), strict=False):

@@ -14,20 +14,29 @@ from estimators.laser.scan_matching import FAILED
 from experiments.bench.icp import BEARINGS_RAD, pair
 from experiments.evaluation.registration_errors import METRICS, measure, sample_scenes
 from experiments.judging.jobs import Tables
-from experiments.papers.decristoforis2020.settings import PLACES, WRONG_M
+from experiments.papers.decristoforis2020.settings import N_TIMED, PLACES, PRINTED, WRONG_M
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Row
 from experiments.runs.seeds import stream
 from sim.sensors import Laser, sensor_of
 
 
-def covariances_of(seed: int, place: str, n_repeats: int, *overrides: str, **how: Any) -> Tables:
+def covariances_of(
+    seed: int,
+    place: str,
+    n_repeats: int,
+    *overrides: str,
+    n_sampled: int | None = None,
+    **how: Any,
+) -> Tables:
     """Many registrations of one pair of poses in a place, and all covariances of them.
 
     Parameters
     ----------
+    n_sampled
+        As for `measure`; None for a quarter of the repeats.
     how
-        Metrics and rules, as for `measure`.
+        Metrics, rules and methods, as for `measure`.
     """
     study, part = PLACES[place]
     given = [f"study=decristoforis2020/{study}", f"seed={seed}", *overrides]
@@ -35,8 +44,21 @@ def covariances_of(seed: int, place: str, n_repeats: int, *overrides: str, **how
     laser = sensor_of(experiment.sensors(), "laser", Laser)
     rng = stream(seed, f"scenes/{place}")
     (scene,) = sample_scenes(experiment.world(), part, laser.mount.pose, rng, 1)
-    found = measure(scene, laser, rng, n_repeats, max(2, n_repeats // 4), **how)
+    n_sampled = n_sampled or max(2, n_repeats // 4)
+    found = measure(scene, laser, rng, n_repeats, n_sampled, **how)
     return {"covariances": found.assign(seed=seed, place=place)}
+
+
+def closed_form_of(seed: int, n_repeats: int) -> Tables:
+    """What DC4 compares, in all places of a world."""
+    parts = [
+        covariances_of(seed, place, n_repeats, n_sampled=N_TIMED, **_COMPARED)["covariances"]
+        for place in PLACES
+    ]
+    return {"closed_form": pd.concat(map(pd.DataFrame, parts), ignore_index=True)}
+
+
+_COMPARED: dict[str, Any] = {"metrics": ["point_to_plane"], "methods": PRINTED}
 
 
 def metrics_of(seed: int, kind: str, rules: Rules) -> Tables:
@@ -65,19 +87,20 @@ def metrics_of(seed: int, kind: str, rules: Rules) -> Tables:
 
 
 def covariance_levels(values: Mapping[str, Any], seed: int, n_repeats: int) -> Row:
-    """How far off each covariance is, as a factor, and its time."""
-    given = {"metrics": [values["estimator.metric"]]}
-    rules = Rules(neighbours=int(values["estimator.neighbours"]))
+    """How far off each covariance is, as a factor over all places of a world, and its time."""
+    how = _COMPARED | {"metrics": [values["estimator.metric"]]}
+    how["rules"] = Rules(neighbours=int(values["estimator.neighbours"]))
     sigma = f"sensors.laser.sigma_range_m={values['sensors.laser.sigma_range_m']}"
-    made = covariances_of(seed, values["place"], n_repeats, sigma, rules=rules, **given)
-    methods = ("hessian_points", "censi_last", "sampling")
-    columns = ["method", "nees_over_dof", "time_us"]
-    # NaN if no pair registers
-    rows = pd.DataFrame(made["covariances"], columns=columns).set_index("method").reindex(methods)
+    parts = [
+        covariances_of(seed, place, n_repeats, sigma, n_sampled=N_TIMED, **how)["covariances"]
+        for place in PLACES
+    ]
+    # a place in which no pair registers has no row
+    rows = pd.concat(map(pd.DataFrame, parts)).groupby("method")
+    off = rows["nees_over_dof"].agg(lambda nees: np.exp(np.log(nees).abs().mean()))
+    times = rows["time_us"].median()
     return {
-        f"{method}_{key}": float(np.exp(abs(np.log(value)))) if key == "off" else float(value)
-        for method in methods
-        for key, value in (
-            ("off", rows.loc[method, "nees_over_dof"]), ("time_us", rows.loc[method, "time_us"])
-        )
-    }  # fmt: skip
+        f"{method}_{key}": float(found.get(method, math.nan))
+        for method in PRINTED
+        for key, found in (("off", off), ("time_us", times))
+    }

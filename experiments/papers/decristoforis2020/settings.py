@@ -7,6 +7,11 @@ PAPERS_OWN = ("odometry", "icp", "fusion")
 CHECKED = (*PAPERS_OWN, "fusion_clone")  # also run at other rates, rays and noise
 N_GEOMETRIES = 20  # of DC4
 N_REPEATS = 60  # registrations of each pair of scans
+N_TIMED = 1  # of which sampling is timed, which takes a thousand times as long
+# As printed: the residual variance of the Hessian is taken from points, Censi's z is the last scan
+PRINTED = ("hessian_points", "sampling", "censi_last")
+N_STRETCH = 24  # pairs of scans on each stretch of a corridor
+APART_M = 0.1  # between scans, as 0.5 m/s at 5 Hz gives
 NEES_AT_M = (5.0, 20.0, 50.0, 95.0)
 CONSISTENT = (0.8, 1.25)  # NEES over its degrees of freedom
 PLACES = {  # where pairs of scans are taken: study, and place of its world

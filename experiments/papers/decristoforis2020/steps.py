@@ -13,13 +13,15 @@ from estimators.laser import icp_covariance
 from estimators.laser.icp import DEFAULT_RULES, Metric, Rules, prepare, register
 from estimators.laser.scan_matching import FAILED
 from experiments.evaluation.metrics import travelled_m
-from experiments.evaluation.scan_bound import fisher_bound
-from experiments.papers.decristoforis2020.settings import HELD_M, WINDOWS_S
+from experiments.evaluation.registration_errors import resample
+from experiments.evaluation.scan_bound import cast, fisher_bound
+from experiments.papers.decristoforis2020.settings import APART_M, HELD_M, N_STRETCH, WINDOWS_S
+from experiments.runs.experiment import Experiment
 from experiments.runs.row import Row
 from sim import se2
 from sim.arrays import Array
 from sim.recording import Recording
-from sim.sensors import Laser
+from sim.sensors import Laser, sensor_of
 from sim.worlds.world import World
 
 
@@ -137,6 +139,42 @@ def ellipse_path(
             "degenerate": degenerate,
         }
     )
+
+
+def stretch_axes(experiment: Experiment, rng: np.random.Generator) -> Row:
+    """Median long axis of the ellipses on the bare stretch and near the objects of a corridor, m.
+
+    Pairs of scans are taken along the middle of the way, without a drive.
+    """
+    laser, world = sensor_of(experiment.sensors(), "laser", Laser), experiment.world()
+    believed, row = experiment.options_of("estimator"), Row()
+    path = resample(world.waypoints, APART_M)
+    places = world.place_of(path[:, :2])
+    for name in ("bare", "objects"):
+        inside = np.flatnonzero(places == f"corridor_{name}")[:-1]
+        use = inside[np.linspace(0, len(inside) - 1, N_STRETCH).astype(int)]
+        axes = []
+        for k in use:
+            poses = se2.compose(path[[k, k + 1]], laser.mount.pose)
+            ranges = [cast(world.walls, pose, laser.bearings_rad)[0] for pose in poses]
+            target, source = (
+                prepare(laser.measure(r, rng), laser.bearings_rad, laser.max_range_m)
+                for r in ranges
+            )
+            rules = Rules(neighbours=believed["neighbours"])
+            motion = se2.between(*poses)
+            found = register(source, target, motion, metric=believed["metric"], rules=rules)
+            if found.status not in FAILED:
+                sigma_m = laser.sigma_range_m
+                R = icp_covariance.censi(
+                    found, source, target, sigma_m, scans="last", everywhere=True
+                )
+                step, _ = Gaussian(found.T_target_source, R).in_sensor(
+                    se2.inverse(laser.mount.pose)
+                )
+                axes.append(math.sqrt(np.linalg.eigvalsh(step.covariance[:2, :2])[1]))
+        row[f"long_{name}_m"] = float(np.median(axes)) if axes else math.nan
+    return row
 
 
 def ellipse_summary(path: pd.DataFrame) -> Row:

@@ -32,8 +32,16 @@ from experiments.judging.region_runs import region_jobs, remake_region
 from experiments.judging.remake import Cells, Remake
 from experiments.judging.results import FIRST_SEED, Profile, Results
 from experiments.judging.sequential import run_worlds
-from experiments.papers.decristoforis2020.claims import dc1, dc3, dc5, dc6, judged_runs
+from experiments.papers.decristoforis2020.claims import (
+    closed_form_against_hessian,
+    dc1,
+    dc3,
+    dc5,
+    dc6,
+    judged_runs,
+)
 from experiments.papers.decristoforis2020.pairs import (
+    closed_form_of,
     covariance_levels,
     covariances_of,
     metrics_of,
@@ -51,7 +59,12 @@ from experiments.papers.decristoforis2020.settings import (
     QUARTER_HZ,
     TURNS_HZ,
 )
-from experiments.papers.decristoforis2020.steps import ellipse_path, ellipse_summary, step_errors
+from experiments.papers.decristoforis2020.steps import (
+    ellipse_path,
+    ellipse_summary,
+    step_errors,
+    stretch_axes,
+)
 from experiments.runs.console import RunFailedError
 from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
@@ -117,7 +130,31 @@ def _designed(profile: Profile) -> list[tuple[list[str], JobsOf, Judge]]:
         (["DC1", "DC6"], partial(_drives, short), lambda t: [*dc1(t["runs"]), *dc6(t["runs"])]),
         (["DC3"], _corridors, lambda t: dc3(t["ellipses"])),
         (["DC5"], _pairs, lambda t: list(dc5(t["metrics"]))),
+        (["DC4"], partial(_closed_forms, profile), _judge_closed_form),
     ]
+
+
+def _closed_forms(profile: Profile, seeds: Sequence[int]) -> list[Call]:
+    return [(closed_form_of, seed, _n_repeats(profile)) for seed in seeds]
+
+
+def _judge_closed_form(made: Mapping[str, pd.DataFrame]) -> list[Claim]:
+    return list(closed_form_against_hessian(made["closed_form"]))
+
+
+def _closed_form(profile: Profile, _: Progress) -> Mapping[str, pd.DataFrame]:
+    blocks = partial(_block, partial(_closed_forms, profile))
+    return run_worlds("decristoforis2020", ["DC4"], profile, blocks, _judge_closed_form)
+
+
+def _region(name: str, profile: Profile, on_progress: Progress) -> Mapping[str, pd.DataFrame]:
+    jobs = region_jobs("decristoforis2020", region_run, profile, name)
+    return tables_of(operator.call, jobs, on_progress)
+
+
+PARTS = {"closed_form": _closed_form} | {
+    f"region_{name}": partial(_region, name) for name in ("DC1", "DC2", "DC4")
+}
 
 
 def _block(jobs_of: JobsOf, seeds: Sequence[int]) -> dict[str, pd.DataFrame]:
@@ -157,7 +194,7 @@ def overrides_at(values: Mapping[str, Any]) -> list[str]:
 def region_run(name: str, values: Mapping[str, Any], seed: int, profile: Profile) -> Row:
     """Levels of a claim's arms at free settings in one world."""
     if name == "DC4":
-        return covariance_levels(values, seed, N_REPEATS if profile is Profile.FULL else 12)
+        return covariance_levels(values, seed, _n_repeats(profile))
     if name == "DC5":
         rules = Rules(neighbours=int(values["estimator.neighbours"]))
         rows = metrics_of(seed, values["pair of scans"], rules)["metrics"]
@@ -169,6 +206,9 @@ def region_run(name: str, values: Mapping[str, Any], seed: int, profile: Profile
             for key in ("error_m", "error_rad", "time_us")
         }
     if name == "DC2":
+        given = ["study=decristoforis2020/corridor", f"seed={seed}", *overrides_at(values)]
+        return stretch_axes(Experiment.compose(given), stream(seed, "stretches"))
+    if name == "DC3":
         (group,) = _planned("corridor", [seed], *overrides_at(values))
         row = _closeup([one for one in group if one.label("method") == "printed"])["ellipses"]
         return dict(pd.DataFrame(row).iloc[0].drop(["seed", "method"]))
@@ -180,6 +220,10 @@ def region_run(name: str, values: Mapping[str, Any], seed: int, profile: Profile
         return {}  # its levels stay empty
     columns = ("ate_rmse_m", "heading_rmse_rad", "map_distance_m")
     return {f"{m}_{column}": float(runs.loc[m, column]) for m in PAPERS_OWN for column in columns}
+
+
+def _n_repeats(profile: Profile) -> int:
+    return N_REPEATS if profile is Profile.FULL else 12
 
 
 def _jobs(profile: Profile, out: Results) -> list[Job]:
@@ -233,6 +277,7 @@ REMADE = {
     "metrics": 0.1,
     "region_DC1": 8.0,
     "region_DC2": 2.0,
+    "region_DC3": 2.0,
     "region_DC4": 2.0,
     "region_DC5": 0.1,
 }  # not pooled errors, and what only figures show
