@@ -160,6 +160,20 @@ def judge_interval(
     return Verdict.NOT_REPRODUCED if outside else Verdict.UNDECIDED
 
 
+def judge_one_side(
+    found: Interval, at_least: float, at_most: float, near: tuple[float, float]
+) -> tuple[Verdict, bool]:
+    """Judge an interval against one limit, and say whether it is shown to be near it.
+
+    What spans the limit but lies within the smallest effect of interest of it, `near`, is
+    decided: there is no effect to speak of, so the claim does not hold.
+    """
+    verdict = judge_interval(found, at_least, at_most)
+    if verdict is Verdict.UNDECIDED and judge_interval(found, *near) is Verdict.REPRODUCED:
+        return Verdict.NOT_REPRODUCED, True
+    return verdict, False
+
+
 def power_of(
     found: Interval,
     effect: float = SMALLEST_EFFECT,

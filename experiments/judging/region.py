@@ -15,6 +15,7 @@ import pandas as pd
 
 from experiments.evaluation.statistics import Interval
 from experiments.judging.claim import SMALLEST_EFFECT, Verdict
+from experiments.judging.corner import corner
 from experiments.judging.free_settings import (
     Anchor,
     Setting,
@@ -115,12 +116,13 @@ class Region:
     share
         Of the region, in which the claim holds by the smallest effect of interest.
     decided_by, boundary
-        The setting that decides, and where the claim begins or ceases to hold along it, in words.
+        The setting that decides, and where the claim begins or ceases to hold along it, in words;
+        where none decides alone or its boundary is not located, the corner in which it holds most.
     called
         The setting's name in sentences; empty: as it is.
     along
-        The setting that matters most, and in how much of the region the claim holds along it, in
-        words; empty where it holds everywhere or nowhere.
+        In how much of the region the claim holds along that setting, in words; empty where the
+        boundary is a corner's.
     failing
         The headline that fails first in most of the rest, in words; empty if there is only one.
     """
@@ -145,9 +147,11 @@ class Region:
         said = [f"The claim holds in {value} % [{low}, {high}] of the region of free settings."]
         is_one = self.decided_by != NONE_ALONE
         if self.along:
-            said += [f"{'' if is_one else 'No single setting decides; '}{self.along}."]
-        if is_one:
-            said += [f"With the others in the middle, it {self.boundary}."]
+            said += [f"{self.along}.", f"With the others in the middle, it {self.boundary}."]
+        elif is_one:
+            said += [f"{self.called} matters most, without a clear boundary; it {self.boundary}."]
+        elif self.boundary not in (NOWHERE, EVERYWHERE):
+            said += [f"No single setting decides; it {self.boundary}."]
         if self.failing:
             said += [f"Where it does not hold, {self.failing}."]
         said += [
@@ -268,7 +272,7 @@ def holding(fitted: Fitted, i: int) -> tuple[Interval, Interval] | None:
 
 
 def boundary_in_words(fitted: Fitted, i: int) -> str:
-    """Where along setting `i` the claim holds, the others at their middle."""
+    """Where along setting `i` the claim holds, the others at their middle; empty: not located."""
     setting, stretch = fitted.settings[i], holding(fitted, i)
     if setting.choices:
         line = np.full((len(setting.choices), len(fitted.settings)), 0.5)
@@ -281,11 +285,12 @@ def boundary_in_words(fitted: Fitted, i: int) -> str:
     if stretch is None:
         return NOWHERE
     low, high = stretch
+    if max(end.high - end.low for end in stretch) >= _LOCATED:
+        return ""
 
     def words(end: Interval) -> str:
         value, least, most = map(as_words, setting.at([end.value, end.low, end.high]))
-        is_located = end.high - end.low < _LOCATED
-        return f"{value} [{least}, {most}]" if is_located else f"{value} (not located)"
+        return f"{value} [{least}, {most}]"
 
     parts = [f"above {words(low)}"] * (low.value > 0.0) + [f"below {words(high)}"] * (
         high.value < 1.0
@@ -328,18 +333,22 @@ def failing_in_words(fitted: Fitted, headlines: Sequence[str]) -> str:
 def describe(fitted: Fitted, anchor: Anchor | None, headlines: Sequence[str] = ()) -> Region:
     """What a fitted region says of its claim, whose headlines are named in words."""
     indices = first_order(fitted)
-    found, first, most = share(fitted), deciding(indices), int(indices[0].argmax())
+    found, first = share(fitted), deciding(indices)
     fails = failing_in_words(fitted, headlines)
     if found.value in (0.0, 1.0):
         at = NOWHERE if found.value == 0.0 else EVERYWHERE
         return Region(anchor, found, NONE_ALONE, at, failing=fails)
-    along = along_in_words(fitted, most)
     boundary = "" if first is None else boundary_in_words(fitted, first)
-    if first is None or boundary in (NOWHERE, EVERYWHERE):
-        at = NOWHERE if boundary == NOWHERE else ""
-        return Region(anchor, found, NONE_ALONE, at, along=along, failing=fails)
+    if first is not None and boundary not in ("", NOWHERE, EVERYWHERE):
+        own, along = fitted.settings[first], along_in_words(fitted, first)
+        return Region(anchor, found, own.name, boundary, own.called, along, fails)
+    units, margins = fitted.spread
+    most = corner(fitted.settings, units, margins.min(axis=0) > 0.0)
+    where = most.words if most else ""
+    if first is None or boundary:
+        return Region(anchor, found, NONE_ALONE, where, failing=fails)
     own = fitted.settings[first]
-    return Region(anchor, found, own.name, boundary, own.called, along, fails)
+    return Region(anchor, found, own.name, where, own.called, failing=fails)
 
 
 def limits_spanned(share: Interval) -> list[float]:

@@ -28,6 +28,7 @@ from experiments.judging.claim import (
     Verdict,
     effect_in_words,
     judge_interval,
+    judge_one_side,
     power_of,
 )
 from experiments.judging.results import Profile, first_seed
@@ -110,13 +111,10 @@ def judge_ratio(
     found = repeated_interval(logs, design.looks, spent)
     found = Interval(*(math.exp(v) for v in (found.value, found.low, found.high)))
     verdict, reason = judge_interval(found, *band), ""
-    near = [limits[0] / (1.0 + design.effect), limits[0] * (1.0 + design.effect)]
-    if (
-        verdict is Verdict.UNDECIDED
-        and len(limits) == 1
-        and judge_interval(found, *near) is Verdict.REPRODUCED
-    ):
-        verdict, reason = Verdict.NOT_REPRODUCED, f"within {100.0 * design.effect:.3g} % of it"
+    if len(limits) == 1:
+        near = limits[0] / (1.0 + design.effect), limits[0] * (1.0 + design.effect)
+        verdict, is_near = judge_one_side(found, *band, near)
+        reason = f"within {100.0 * design.effect:.3g} % of it" if is_near else ""
     look, cap = int(np.searchsorted(design.looks, len(logs), side="right")), design.looks[-1]
     is_open = verdict is Verdict.UNDECIDED and len(logs) < cap
     words = " and ".join(

@@ -96,7 +96,8 @@ def covariance_levels(values: Mapping[str, Any], seed: int, n_repeats: int) -> R
         for place in PLACES
     ]
     # a place in which no pair registers has no row
-    rows = pd.concat(map(pd.DataFrame, parts)).groupby("method")
+    columns = ["method", "nees_over_dof", "time_us"]
+    rows = pd.concat(pd.DataFrame(part, columns=columns) for part in parts).groupby("method")
     off = rows["nees_over_dof"].agg(lambda nees: np.exp(np.log(nees).abs().mean()))
     times = rows["time_us"].median()
     return {

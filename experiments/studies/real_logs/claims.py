@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -16,6 +18,7 @@ from experiments.judging.claim import (
     beside,
     holds,
     judge_bounds,
+    judge_one_side,
     shown,
     with_remark,
 )
@@ -79,8 +82,12 @@ def _difference(about: Subject, fused: pd.Series[float], rival: pd.Series[float]
     ours_m, other_m = float(fused.translation_mean_m), float(rival.translation_mean_m)
     effect_m = SMALLEST_EFFECT * other_m
     claim = judge_bounds(about, label, found, at_most=0.0, criterion="below 0", effect=effect_m)
+    verdict, is_near = judge_one_side(found, -math.inf, 0.0, (-effect_m, effect_m))
     remark = f"fusion {ours_m:.3f} m, the other {other_m:.3f} m"
-    return with_remark(claim, remark, fused_m=ours_m, other_m=other_m)
+    if is_near:
+        remark += f", alike within {100.0 * SMALLEST_EFFECT:.0f} %"
+    facts = {"fused_m": ours_m, "other_m": other_m, "is_near": is_near}
+    return with_remark(replace(claim, verdict=verdict), remark, **facts)
 
 
 def rl3(mrclam: pd.DataFrame) -> Iterator[Claim]:

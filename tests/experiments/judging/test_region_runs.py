@@ -29,7 +29,7 @@ from experiments.judging.region_runs import (
     remake_region,
     set_apart,
 )
-from experiments.judging.results import FIRST_SEED, Profile, Results
+from experiments.judging.results import FIRST_SEED, Profile, Results, first_seed
 from experiments.judging.sentences import WAITING, conclude
 from experiments.judging.sequential import run_worlds
 
@@ -65,13 +65,13 @@ def made(tmp_path):
 
 def test_a_region_goes_from_its_runs_to_a_boundary(made):
     found = judged_regions(made, HEADLINES)
-    assert set(found) == {"DC2", "DC3"}  # which share the runs
+    assert set(found) == {CLAIM}
     assert 0.2 < found[CLAIM].share.value < 0.8
     assert found[CLAIM].decided_by == KEY
     assert found[CLAIM].boundary.startswith("holds below 1")
     assert found[CLAIM].anchor.settings[KEY] == 13
-    pages = region_pages(made, {CLAIM: HEADLINES[CLAIM], "DC3": HEADLINES["DC3"]})
-    assert set(pages) == {f"{STUDY}_region_DC2", f"{STUDY}_region_DC3"}
+    pages = region_pages(made, HEADLINES)
+    assert set(pages) == {f"{STUDY}_region_{CLAIM}"}
     assert set(pages) <= set(findings(STUDY)["figures"])
 
 
@@ -88,6 +88,17 @@ def test_rows_of_a_region_are_made_again(made):
     function, arguments = remake_region(STUDY, planted, f"region_{CLAIM}", row)
     (again,) = function(*arguments)[f"region_{CLAIM}"]
     assert again["a"] == pytest.approx(row["a"], rel=1e-9)
+
+
+def test_a_region_has_the_points_worlds_and_fresh_seeds_of_its_design():
+    jobs = region_jobs(STUDY, planted, Profile.FULL, CLAIM)
+    free = free_settings(STUDY)[CLAIM]
+    assert (free.n_points, free.n_worlds) == (256, 2)
+    assert [job[5] for job in jobs] == [5000 + i for i in range(512)]  # 1000 after the anchor's
+    assert first_seed(STUDY, CLAIM, Profile.FULL) == 4000
+    assert first_seed(STUDY, "DC1", Profile.FULL) == 2000  # the design names none for it
+    assert first_seed(STUDY, CLAIM, Profile.QUICK) == 0
+    assert {job[2] for job in jobs} == {CLAIM}
 
 
 def test_tuning_and_judged_seeds_do_not_meet():

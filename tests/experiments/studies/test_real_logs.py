@@ -49,6 +49,14 @@ def test_rl2_judges_the_paired_difference(low, high, verdict):
     assert ("would decide an effect of 0.1" in said(found)) == (verdict == "undecided")
 
 
+def test_rl2_counts_arms_within_a_tenth_as_alike():
+    found = list(rl2(relations(-0.05, 0.04)))
+    assert {c.verdict for c in found[:4]} == {"not_reproduced"}
+    assert found[1].reason.endswith("alike within 10 %")
+    assert "Fusion and ICP alone are alike" in said(found)
+    assert {c.verdict for c in list(rl2(relations(-0.11, 0.04)))[:4]} == {"undecided"}
+
+
 def test_rl1_rl4_and_rl5_can_fail():
     ate = pd.DataFrame({"ate_m": [0.1491, 0.2272], "printed_m": ["0.149", "0.227"]})
     assert rl1(ate).verdict == "reproduced"
