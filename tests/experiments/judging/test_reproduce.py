@@ -134,6 +134,27 @@ def test_what_cannot_be_replaced_or_added_to_is_named(results):
         module.reproduce(only=PAPER)
 
 
+def test_a_part_replaces_its_own_tables_alone(results, monkeypatch):
+    def one(profile, on_progress):
+        return {"noise": pd.DataFrame({"profile": ["again"]})}
+
+    parts = study()
+    parts["study"].PARTS = {"noise": one}
+    take(monkeypatch, parts)
+    before = json.loads((results / "built.json").read_text())["items"]
+    runs = (results / "tables" / f"{PAPER}_runs.csv").read_bytes()
+    module.reproduce(only=PAPER, part="noise")
+    assert pd.read_csv(results / "tables" / f"{PAPER}_noise.csv")["profile"].tolist() == ["again"]
+    assert (results / "tables" / f"{PAPER}_runs.csv").read_bytes() == runs
+    after = json.loads((results / "built.json").read_text())["items"]
+    assert after[f"tables/{PAPER}_runs.csv"] == before[f"tables/{PAPER}_runs.csv"]
+    assert state(results) == (FULL, "full", "reproduced, full", "full")
+    with pytest.raises(
+        InputError, match="gil2008 has no part 'runs' to be made alone; it has noise"
+    ):
+        module.reproduce(only=PAPER, part="runs")
+
+
 def test_figures_are_drawn_again_from_disk(results, monkeypatch, capsys):
     path = results / "figures" / f"{PAPER}_runs.png"
     path.unlink()
