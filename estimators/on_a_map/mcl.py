@@ -50,6 +50,7 @@ from sim.worlds.world import World
 Recovery = Literal["none", "average", "rivals"]
 
 _BISECTIONS = 12
+_ASKED = 32  # particles of which a scan that is not used is asked
 _SAMPLED = 16  # one in so many poses tried on the floor decides by how much a scan counts there
 _MOST_PARTICLES, _MOST_TRIES = 10_000_000, 100_000_000  # 0.2 and 2 GB of poses
 _FARTHEST_M, _FARTHEST_RAD = 1.0, 0.5  # of what belongs to one hypothesis
@@ -201,9 +202,9 @@ class Mcl(MclOptions):
     The mean is that of the hypothesis (particles within 1 m and 0.5 rad) of greatest weight; the
     covariance is that of all particles about it, so it shows whether there are others. Extras, of
     the last scan used: `particles` (M, 3), `log_weights` (M,), `ess`, `hypothesis_weight`,
-    `fit`, the likelihood of a beam at the best particle, `lost`, 1 less the product of these two,
-    and `injected`, the number of particles injected, those of rivals that became the belief
-    included; `status` when a scan saw nothing.
+    `fit`, the likelihood of a beam at the best particle, `lost`, 1 less the product of these two
+    (of a scan that was not used, too), and `injected`, the number of particles injected, those of
+    rivals that became the belief included; `status` when a scan saw nothing.
     """
 
     needs = frozenset({"laser", "map"})
@@ -246,8 +247,12 @@ class Mcl(MclOptions):
         extras: dict[str, Any] = {"status": "start off the map"} if self._off_map else {}
         self._off_map = False
         scan = frame.readings.get(self.laser)
-        if scan is not None and self._is_due():
+        is_due = self._is_due()
+        if scan is not None:
             ends = beam_ends(scan["ranges_m"], self._laser, self.n_beams)
+        if scan is not None and not is_due and ends.shape[1]:
+            extras["lost"] = self._doubt(ends)
+        if scan is not None and is_due:
             self._move()
             self._seen = True
             if ends.shape[1] == 0:
@@ -264,6 +269,16 @@ class Mcl(MclOptions):
         x, y, turn = self._motion.mean
         far = math.hypot(x, y) >= self.update_distance_m or abs(turn) >= self.update_turn_rad
         return far or not self._seen
+
+    def _doubt(self, ends: Floats) -> float:
+        """How ill a scan fits that is not used: as `lost`, at some of the particles.
+
+        Wheels that stand or are lifted while the robot goes on never bring it to a new place.
+        """
+        few = self._poses[:: max(1, len(self._poses) // _ASKED)]
+        of_scan = self._field.log_likelihood(se2.compose(few, self._motion.mean), ends)
+        fit = math.exp(float(np.max(of_scan)) / ends.shape[1])
+        return 1.0 - fit * float(self._extras["hypothesis_weight"])
 
     def _move(self) -> None:
         """Draw the motion since the last scan used, for each particle."""

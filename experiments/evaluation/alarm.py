@@ -4,7 +4,8 @@ It is lost while its position is off by more than `LOST_M`, for `HOLD_S` at leas
 its extra `lost`, if it gives one, else the standard deviation of its position along the worst
 direction; an alarm stands while that is at or above a threshold. A loss is missed if no alarm
 stands within `DELAY_S` of its beginning. False alarms are counted in windows of `WINDOW_S`, each as
-one, that hold neither a loss nor the `DELAY_S` after one.
+one, that hold neither a loss nor the `DELAY_S` before or after one: a method that sees its error
+grow warns before it is lost.
 """
 
 from collections.abc import Sequence
@@ -29,7 +30,7 @@ class Evidence(NamedTuple):
     peaks
         (L,) the most in the first `DELAY_S` of each loss.
     quiet
-        (W,) the most in each window without one.
+        (W,) the most in each window apart from them.
     """
 
     peaks: Array
@@ -64,14 +65,16 @@ def evidence_of(truth: Array, estimate: Estimate) -> Evidence:
         signal[(stamps >= begin) & (stamps <= min(end, begin + DELAY_S))].max()
         for begin, end in losses
     ]
+    apart = losses + np.array([-DELAY_S, DELAY_S])
     starts = np.arange(stamps[0], stamps[-1] - WINDOW_S + 1e-9, WINDOW_S)
-    clear = [
-        start
-        for start in starts
-        if not ((start < losses[:, 1] + DELAY_S) & (start + WINDOW_S > losses[:, 0])).any()
-    ]
+    clear = [start for start in starts if not _meets(apart, start, start + WINDOW_S)]
     quiet = [signal[(stamps >= s) & (stamps < s + WINDOW_S)].max(initial=0.0) for s in clear]
     return Evidence(np.array(peaks, np.float64), np.array(quiet, np.float64))
+
+
+def _meets(spans: Array, begin: float, end: float) -> bool:
+    """Whether any of some spans (L, 2) shares time with another."""
+    return bool(((begin < spans[:, 1]) & (end > spans[:, 0])).any())
 
 
 def alarm_curve(runs: Sequence[Evidence]) -> Array:

@@ -265,8 +265,8 @@ def own_design(claim: str, design: str, hits: ArrayLike) -> Claim:
     shows = np.asarray(hits, bool)
     share = share_interval(int(shows.sum()), len(shows))
     said = (
-        f"The paper's own design is {design}: {int(shows.sum())} of {len(shows)} such trials show "
-        "what it says."
+        f"The paper's own design, {design}, shows what it says in {int(shows.sum())} of "
+        f"{len(shows)} repetitions."
     )
     about = Subject(claim, OWN_DESIGN, arm=design)
     return shown(about, f"share of cases in which {design} shows it", share, said)

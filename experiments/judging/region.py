@@ -124,7 +124,7 @@ class Region:
         In how much of the region the claim holds along that setting, in words; empty where the
         boundary is a corner's.
     failing
-        The headline that fails first in most of the rest, in words; empty if there is only one.
+        The headline that misses its limit by most in the rest, in words; empty if there is one.
     """
 
     anchor: Anchor | None
@@ -144,7 +144,10 @@ class Region:
             The printed level that the anchor has, in words.
         """
         value, low, high = map(_percent, (self.share.value, self.share.low, self.share.high))
-        said = [f"The claim holds in {value} % [{low}, {high}] of the region of free settings."]
+        said = [
+            "Over the settings that the paper leaves open, each within its plausible range, the "
+            f"claim holds in {value} % [{low}, {high}]."
+        ]
         is_one = self.decided_by != NONE_ALONE
         if self.along:
             said += [f"{self.along}.", f"With the others in the middle, it {self.boundary}."]
@@ -152,13 +155,16 @@ class Region:
             said += [f"{self.called} matters most, without a clear boundary; it {self.boundary}."]
         elif self.boundary not in (NOWHERE, EVERYWHERE):
             said += [f"No single setting decides; it {self.boundary}."]
+        if self.boundary in (NOWHERE, EVERYWHERE):
+            said += ["Nothing beyond the ranges was tried, so what would change this is not known."]
         if self.failing:
             said += [f"Where it does not hold, {self.failing}."]
         said += [
-            f"The interval contains {100 * limit:.0f} %, {what}, so the claim is undecided."
+            f"The interval of this share contains {100 * limit:.0f} %, the limit between {what}, "
+            "so the claim is undecided."
             for limit, what in (
-                (LEAST, "the limit below which a claim counts as failing in the region"),
-                (MOST, "the limit above which it counts as holding in the region"),
+                (LEAST, "failing and depending on the settings"),
+                (MOST, "depending on the settings and holding"),
             )
             if limit in limits_spanned(self.share)
         ]
@@ -318,7 +324,7 @@ def along_in_words(fitted: Fitted, i: int) -> str:
 
 
 def failing_in_words(fitted: Fitted, headlines: Sequence[str]) -> str:
-    """The ratio that fails first in most of the region where the claim does not hold."""
+    """The headline that misses its limit by most where the claim does not hold."""
     each = fitted.spread[1][:, 0]
     failing = each[:, each.min(axis=0) <= 0.0]
     if len(headlines) < 2 or not failing.size:
@@ -327,7 +333,7 @@ def failing_in_words(fitted: Fitted, headlines: Sequence[str]) -> str:
     most = int(count.argmax())
     part = count[most] / count.sum()
     mostly = "" if part == 1.0 else f", in {_percent(part)} % of it"
-    return f'the ratio "{headlines[most]}" fails first{mostly}'
+    return f'"{headlines[most]}" misses its limit by most{mostly}'
 
 
 def describe(fitted: Fitted, anchor: Anchor | None, headlines: Sequence[str] = ()) -> Region:

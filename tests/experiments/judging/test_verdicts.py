@@ -218,7 +218,7 @@ def test_every_claim_has_one_verdict_and_a_plain_sentence(tracked):
         assert "nan" not in each.sentence
         assert not re.search(r"unknown times|unknown share|\de\+\d", each.sentence)
         if each.verdict is Verdict.UNDECIDED:
-            why = r"of 100 would |interval contains [28]0 %, the limit"
+            why = r"of 100 would |interval of this share contains [28]0 %"
             assert re.search(why, each.sentence)
 
 

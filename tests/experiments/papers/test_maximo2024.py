@@ -51,9 +51,9 @@ def test_mx1_follows_the_errors():
     assert headlines(said) == ["reproduced"] * 4
     found = concluded("maximo2024", said)
     assert found.verdict == "reproduced"
-    assert found.sentence.startswith("With made descriptors")
+    assert found.sentence.startswith("With synthetic descriptors")
     assert "reproduced (M3 over M2: 21 [" in found.sentence
-    assert "ten runs: 24 of 24 such trials show" in found.sentence
+    assert "ten runs, shows what it says in 24 of 24 repetitions" in found.sentence
     for umh, at in (({"m1": 0.3}, 2), ({"m3": 0.6}, 3)):
         assert headlines(claims.mx1(both_routes(**umh)))[at] == "not_reproduced"
     oxford = pd.concat([weighting(9.0, 9.61, 20.0), weighting(0.8, 0.4, 0.44, "umh")])
@@ -100,7 +100,7 @@ def test_mx2_wants_equal_errors_and_rising_times():
     assert said[3].found.low == pytest.approx(2.0 / 1.1)  # the interval spans the timings
     assert said[6].found.value == pytest.approx(2.0)
     found = concluded("maximo2024", claims.mx2(table, node_times()))
-    assert "The time grows up to 2 times" in found.sentence
+    assert "the time grows by a factor of up to 2;" in found.sentence
     assert "on Oxford is at least 2 times that on UMH" in found.sentence
     worse = table.assign(error_m=table["error_m"] * np.where(table["per_node"] == 2, 1.3, 1.0))
     assert next(iter(claims.mx2(worse, node_times()))).verdict == "not_reproduced"
@@ -192,7 +192,7 @@ def test_mx5_is_judged_on_descriptors_of_clouds():
     worse = clouds.assign(contiguous=[0.5, 0.52, 0.51])
     assert headlines(claims.mx5(made, worse)) == ["not_reproduced"]
     said = concluded("maximo2024", claims.mx5(made, clouds)).sentence
-    assert "(M2DP); more than 80 % are asked. With made descriptors" in said
+    assert "(M2DP); more than 80 % are asked. With synthetic descriptors" in said
 
 
 def test_our_own_claims_follow_their_tables():

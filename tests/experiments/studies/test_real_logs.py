@@ -34,7 +34,10 @@ def test_rl2_judges_after_the_tuned_part_and_shows_the_whole():
     assert found[0].reason == "fusion 0.100 m, the other 1.000 m"
     assert [c.role for c in found[:4]] == ["beside", "headline", "headline", "headline"]
     assert {c.about.place for c in found[4:]} == {"the whole log"}
-    assert "0.100 m by fusion; 1.000 m by odometry, calibrated;" in said(found)
+    assert (
+        "0.100 m by fusion; 1.000 m by odometry, calibrated (difference -0.9 [-1, -0.8] m);"
+        in said(found)
+    )
 
 
 @pytest.mark.parametrize(
