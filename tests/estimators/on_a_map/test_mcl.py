@@ -65,6 +65,17 @@ def test_says_that_it_is_lost():
     assert min(belief.extras["lost"] for belief in there[1:]) > 0.4
 
 
+def test_a_scan_that_is_not_used_tells_of_wheels_that_stand():
+    _, frames = drive(ROOM, 60, wheel_noise_m=NOISE_M)
+    still = [dataclasses.replace(f, wheel_increments_m=np.zeros(2)) for f in frames[30:]]
+    lifted = [*frames[:30], *still]
+    beliefs = follow(Mcl(**WHEELS, recovery="none"), lifted, prior())
+    said = [belief.extras["lost"] for belief in beliefs]
+    assert beliefs[29].extras["particles"] is beliefs[-1].extras["particles"]  # none is used
+    assert max(said[:30]) < 0.2
+    assert said[-1] > 0.4
+
+
 def test_knows_its_error():
     """With likelihoods at their worth and no jitter, over recordings, and scans of 60 beams."""
     squares = []
