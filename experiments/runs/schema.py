@@ -17,7 +17,7 @@ from estimators.team import Communication
 from experiments.runs.paths import CONF
 from sim import sensors
 from sim.errors import InputError, describe_unknown, require
-from sim.options import Count, NonNegative, Option, Positive, described, find, options
+from sim.options import Count, NonNegative, Positive, defaults, described, find, options
 from sim.people.walk import People
 from sim.robot.drive import DifferentialDrive
 
@@ -204,21 +204,21 @@ def _target(settings: DictConfig, place: str) -> Callable[..., Any]:
 def _filled(target: Callable[..., Any], given: Mapping[str, Any]) -> Config:
     """Keys and their values, in the order of the target's own, with its defaults."""
     filled = {"_target_": given["_target_"]} if "_target_" in given else {}
-    for option in _options(target):
-        value = given.get(option.name, _plain(option.default))
-        if dataclasses.is_dataclass(option.default) and isinstance(value, dict):
-            value = _filled(type(option.default), value)
+    for name, default in _defaults(target).items():
+        value = given.get(name, _plain(default))
+        if dataclasses.is_dataclass(default) and isinstance(value, dict):
+            value = _filled(type(default), value)
         if value is not _UNSET:
-            filled[option.name] = value
+            filled[name] = value
     return {**filled, **{name: value for name, value in given.items() if name not in filled}}
 
 
-def _options(target: Callable[..., Any]) -> list[Option]:
-    """Options of what a configuration names; none of what has no signature."""
+def _defaults(target: Callable[..., Any]) -> dict[str, Any]:
+    """Defaults of what a configuration names; none of what has no signature."""
     try:
-        return [option for option in described(target) if option.name not in _INJECTED]
+        return {name: each for name, each in defaults(target).items() if name not in _INJECTED}
     except ValueError:
-        return []
+        return {}
 
 
 def _plain(value: Any) -> Any:
@@ -288,7 +288,8 @@ def describe_option(group: str, name: str, searched: Sequence[str] = ()) -> str:
 
 def _said(target: Callable[..., Any], stated: Mapping[str, Any]) -> Iterator[str]:
     """A line for each option, and one of its meaning."""
-    for option in _options(target):
+    known = _defaults(target)
+    for option in (each for each in (described(target) if known else ()) if each.name in known):
         value = stated.get(option.name, option.default)
         words = {dataclasses.MISSING: "needed", None: "null", True: "true", False: "false"}
         shown = next((said for known, said in words.items() if value is known), value)
