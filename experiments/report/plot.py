@@ -28,7 +28,8 @@ from experiments.sweeps.collect import (
     result_columns,
     with_answers,
 )
-from experiments.viewing.plotting import literal, name_ends, plain_log
+from experiments.viewing.plan import literal
+from experiments.viewing.plotting import name_ends, plain_log
 from experiments.viewing.style import SERIES, figure
 from sim.errors import InputError, require
 

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from experiments.evaluation.metrics import CHI2_95_2DOF
 from experiments.viewing.grid import draw_grid
+from experiments.viewing.plan import literal, plan_axes
 from experiments.viewing.playback import Playback, RobotTrack, last_row
-from experiments.viewing.plotting import literal, plan_axes
 from experiments.viewing.style import (
     BLACK,
     BLUE,

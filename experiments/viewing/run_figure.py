@@ -13,7 +13,7 @@ from estimators.base import Estimate
 from experiments.evaluation.metrics import position_errors_m, travelled_m
 from experiments.runs.experiment import Experiment
 from experiments.trajectories.convert import write_estimate
-from experiments.viewing.plotting import draw_ellipses, literal, plan_axes
+from experiments.viewing.plan import draw_ellipses, literal, plan_axes
 from experiments.viewing.style import (
     ESTIMATE,
     ORANGE,

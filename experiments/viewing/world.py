@@ -8,7 +8,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from experiments.viewing.plotting import plan_axes
+from experiments.viewing.plan import plan_axes
 from experiments.viewing.style import (
     BLACK,
     BLUE,

@@ -14,13 +14,12 @@ from experiments.judging.region_runs import region_pages
 from experiments.judging.results import Arrays, Results
 from experiments.papers.decristoforis2020.claims import HEADLINES, judged_runs, nees_intervals
 from experiments.papers.decristoforis2020.settings import CONSISTENT, PAPERS_OWN, PLACES
+from experiments.viewing.plan import draw_ellipses, plan_axes
 from experiments.viewing.plotting import (
     draw_dots,
-    draw_ellipses,
     draw_interval,
     plain_log,
     plain_ticks,
-    plan_axes,
     with_legend,
 )
 from experiments.viewing.style import (

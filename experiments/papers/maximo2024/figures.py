@@ -21,14 +21,8 @@ from experiments.papers.maximo2024.settings import (
     PRINTED_5,
     RECOVERED_WITHIN,
 )
-from experiments.viewing.plotting import (
-    draw_band,
-    draw_dots,
-    plain_log,
-    plan_axes,
-    set_axes,
-    with_legend,
-)
+from experiments.viewing.plan import plan_axes
+from experiments.viewing.plotting import draw_band, draw_dots, plain_log, set_axes, with_legend
 from experiments.viewing.style import BLACK, BLUE, CYCLE, GREEN, ORANGE, RED, SKY, WALL, subplots
 
 _COLOUR = {"M1": ORANGE, "M2": BLUE, "M3": GREEN}
