@@ -25,7 +25,7 @@ from sim.team import Team
 from tests.fixtures.fakes import circle
 
 ROOT = Path(__file__).resolve().parents[3]
-QUICK = ["simulation.physics=kinematic", "simulation.rays=exact"]
+QUICK = ["simulation.physics=kinematic", "simulation.rays=exact", "picture=false"]
 
 
 def estima(*arguments, cwd=ROOT, **environment):
@@ -112,10 +112,12 @@ def test_options_describes_an_option_of_ones_own_folder(tmp_path):
 
 def test_a_run_prints_its_errors_and_leaves_a_row(tmp_path):
     place = {"ESTIMA_RESULTS": str(tmp_path / "mine")}
-    done = estima("run", *QUICK, "seed=12", "name=test_cli", cwd=tmp_path, **place)
+    done = estima("run", *QUICK, "picture=true", "seed=12", "name=test_cli", cwd=tmp_path, **place)
     assert done.returncode == 0, done.stderr
     assert "position RMSE" in done.stdout
-    frame = read_runs(tmp_path / "mine" / "runs" / "test_cli")
+    rows = tmp_path / "mine" / "runs" / "test_cli"
+    frame = read_runs(rows)
+    assert [path.parent.parent for path in rows.rglob("run.png")] == [rows]
     assert frame["status"].tolist() == ["ok"]
     assert frame["robot.kr"].tolist() == [1e-5]
     assert np.isfinite(frame["ate_rmse_m"]).all()
@@ -284,10 +286,10 @@ def test_damaged_recordings_are_refused(tmp_path):
     path = tmp_path / "r.npz"
     assert estima("record", "-o", str(path), *QUICK, "route=linear_1").returncode == 0
     assert "frames" in estima("info", str(path)).stdout
-    believed = estima("run", *QUICK, f"recording={path}", "name=test_cli", "picture=false")
+    believed = estima("run", *QUICK, f"recording={path}", "name=test_cli")
     assert "robot.kr" not in believed.stderr
     assert f"odometry on {path}" in believed.stdout
-    other = ["robot=robocom", "estimator.kr=1e-5", "name=test_cli", "picture=false"]
+    other = ["robot=robocom", "estimator.kr=1e-5", "name=test_cli"]
     believed = estima("run", *QUICK, f"recording={path}", *other)
     assert "was made with robot.kr=1e-05" in believed.stderr
     path.write_bytes(path.read_bytes()[:-100])
