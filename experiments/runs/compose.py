@@ -22,12 +22,12 @@ from omegaconf.errors import InterpolationKeyError, OmegaConfBaseException
 from experiments.runs import paths
 from experiments.runs.calibration import mean_slip, read_calibrations
 from experiments.runs.console import TRUSTING
-from experiments.runs.option_files import compose_files, state_of_files
 from experiments.runs.schema import (
     GROUPS,
     KEYS,
     Config,
     check_shape,
+    compose_files,
     describe_unknown_key,
     fill,
     leaves,
@@ -125,8 +125,6 @@ class Composer:
             [*searching, *(searched(folder)[0] for folder in studies.values())],
             only_folders=bool(data),
         )
-        places = [place for word in self.extra for place in _places(parse_override(word))]
-        self._state = state_of_files(places)
         self.parse = functools.lru_cache(maxsize=4096)(parse_override)
         self._is_group: dict[str, bool] = {}
         self._bases: dict[tuple[str, ...], Composed] = {}
@@ -188,8 +186,7 @@ class Composer:
         """The configuration of some options, and of targets in place of theirs, filled up."""
         key = tuple(o.input_line or "" for o in (*options, *targets))
         if key not in self._bases:
-            lines = [*self.extra, *(o.input_line or "" for o in options)]
-            composed = compose_files(lines, self._state)
+            composed = compose_files([o.input_line or "" for o in options], self.extra)
             cfg, choices = composed.cfg, composed.choices
             _check_added(options, {choice.partition("@")[0] for choice in choices})
             require(

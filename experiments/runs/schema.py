@@ -1,19 +1,21 @@
-"""What a configuration holds: its keys, and the defaults of what it names."""
+"""What a configuration holds: its keys, the defaults of what it names, and its files' options."""
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from enum import Enum
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
 from pydantic import Field
 
 from estimators.team import Communication
+from experiments.runs.dependencies.recorder import is_recording
 from experiments.runs.paths import CONF
 from sim import sensors
 from sim.errors import InputError, describe_unknown, require
@@ -350,3 +352,55 @@ def robot_config(config: Config, settings: TeamSettings, number: int) -> Config:
             raise InputError(describe_unknown(key, own[group], where))
         own[group] = {**own[group], **values}
     return own
+
+
+# What Hydra composes
+
+
+class FromFiles(NamedTuple):
+    """A configuration as Hydra composes it.
+
+    Attributes
+    ----------
+    cfg
+        The configuration, without Hydra's own.
+    choices
+        Name of the chosen option of each group.
+    params
+        `hydra.sweeper.params` of a study's file.
+    """
+
+    cfg: DictConfig
+    choices: Mapping[str, str]
+    params: Mapping[str, str]
+
+
+def compose_files(overrides: Sequence[str], searched: Sequence[str] = ()) -> FromFiles:
+    """Compose a configuration, which takes Hydra 50 ms; it is kept while conf/ is the same.
+
+    While dependencies are recorded, the files are read each time, so that they are seen.
+
+    Parameters
+    ----------
+    searched
+        Overrides that make Hydra look for options elsewhere too; then nothing is kept.
+    """
+    if searched or is_recording():
+        return _composed((*searched, *overrides))
+    files = ((str(path), path.stat()) for path in sorted(CONF.rglob("*.yaml")))
+    state = tuple((name, s.st_mtime_ns, s.st_size, s.st_ino) for name, s in files)
+    kept = _kept(tuple(overrides), state)
+    return kept._replace(cfg=kept.cfg.copy())
+
+
+def _composed(overrides: Sequence[str]) -> FromFiles:
+    cfg = compose("config", overrides=list(overrides), return_hydra_config=True)
+    choices, params = dict(cfg.hydra.runtime.choices), cfg.hydra.sweeper.get("params") or {}
+    OmegaConf.set_struct(cfg, False)
+    del cfg["hydra"]
+    return FromFiles(cfg, choices, dict(params))
+
+
+@functools.lru_cache(maxsize=256)
+def _kept(overrides: tuple[str, ...], _state: tuple[Any, ...]) -> FromFiles:
+    return _composed(overrides)

@@ -14,7 +14,6 @@ from experiments.judging.region_runs import region_pages
 from experiments.judging.results import Arrays, Results
 from experiments.papers.decristoforis2020.claims import HEADLINES, judged_runs, nees_intervals
 from experiments.papers.decristoforis2020.settings import CONSISTENT, PAPERS_OWN, PLACES
-from experiments.viewing.plan import draw_ellipses, plan_axes
 from experiments.viewing.plotting import (
     draw_dots,
     draw_interval,
@@ -31,7 +30,9 @@ from experiments.viewing.style import (
     RED,
     SKY,
     TRUTH,
+    draw_ellipses,
     figure,
+    plan_axes,
     subplots,
 )
 from experiments.viewing.world import draw_walls
