@@ -161,7 +161,7 @@ def test_the_best_of_equal_arms_is_hardly_ever_dropped():
     rng, wrong = np.random.default_rng(0), 0
     looks = until.plan_looks(60, until.FIRST_LOOK)
     interval = functools.partial(until.repeated_interval, looks=looks, spent=until.SPENT / 4)
-    n_sweeps, names = 400, dict(enumerate("abcde"))
+    n_sweeps, names = 200, dict(enumerate("abcde"))
     for _ in range(n_sweeps):
         logs = pd.DataFrame(rng.normal(0.0, 0.3, size=(60, 5)))
         alive, lost = set(range(5)), set()
