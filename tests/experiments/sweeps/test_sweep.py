@@ -269,9 +269,9 @@ def test_values_that_no_column_holds_fail_alone(name):
     assert (rows["status"] == "ok").sum() == 3
     out = folder(name).parent / f"{name}.csv"
     try:
-        assert estima("table", name, "--rows", "-o", str(out)).returncode == 0
+        assert called("table", name, "--rows", "-o", str(out)).returncode == 0
         assert len(read_rows(out)) == 6
-        plotted = estima("plot", name, "--x", "seed", "-o", str(out.with_suffix(".xyz")))
+        plotted = called("plot", name, "--x", "seed", "-o", str(out.with_suffix(".xyz")))
         assert plotted.returncode == 2
         assert "3 of 6 runs failed" in plotted.stderr
         assert "a picture is .png" in plotted.stderr
