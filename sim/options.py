@@ -217,31 +217,43 @@ def find(target: Any, where: str) -> Callable[..., Any]:
     return found  # type: ignore[no-any-return]
 
 
+def defaults(target: Any) -> dict[str, Any]:
+    """Default of each option of a class or function, in order; `dataclasses.MISSING` for none.
+
+    Raises
+    ------
+    ValueError
+        If it has no signature.
+    """
+    return {
+        name: dataclasses.MISSING if parameter.default is parameter.empty else parameter.default
+        for name, parameter in inspect.signature(target).parameters.items()
+        if parameter.kind not in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD)
+    }
+
+
 def described(target: Any) -> list[Option]:
     """Options of a class or function: of its signature, in order, with the fields' meanings."""
     meanings: dict[str, str] = {}
     for base in reversed(getattr(target, "__mro__", ())):
         meanings |= _meanings(base) if "_options_place" in vars(base) else {}
-    found = []
     try:
         kinds = get_type_hints(target, include_extras=True)
     except NameError:  # of a stranger's class, whose types are not all imported at run time
         kinds = {}
-    for name, parameter in inspect.signature(target).parameters.items():
-        if parameter.kind in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD):
-            continue
-        bare = parameter.default is parameter.empty
-        found.append(
-            Option(
-                name,
-                dataclasses.MISSING if bare else parameter.default,
-                accepted(kinds.get(name, parameter.annotation)),
-                meanings.get(name, ""),
-            )
+    parameters = inspect.signature(target).parameters
+    return [
+        Option(
+            name,
+            default,
+            accepted(kinds.get(name, parameters[name].annotation)),
+            meanings.get(name, ""),
         )
-    return found
+        for name, default in defaults(target).items()
+    ]
 
 
+@functools.cache
 def _meanings(cls: type) -> dict[str, str]:
     """Docstrings below the fields of a class, on one line each; reading them takes milliseconds."""
     try:

@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy import stats
 
 from experiments.calibration.end_poses import Manoeuvre, from_end_poses
 from experiments.calibration.reference import spaced_rows
@@ -181,8 +181,8 @@ def _wheel(encoder_m: Array, ground_m: Array, geometry: bool) -> tuple[Interval,
     k = float(np.sum(residual**2)) / total_m * dof / left
     scatter = float(np.sum((residual**2 - k * travel) ** 2))
     shown = min(left, 2.0 * (k * total_m) ** 2 / scatter) if scatter > 0.0 else left
-    low, high = shown * k / stats.chi2.ppf([0.975, 0.025], shown)
-    half = float(stats.t.ppf(0.975, left)) * math.sqrt(k / total_m)
+    low, high = shown * k / scipy.stats.chi2.ppf([0.975, 0.025], shown)
+    half = float(scipy.stats.t.ppf(0.975, left)) * math.sqrt(k / total_m)
     of_bias = Interval(bias, bias - half, bias + half) if geometry else None
     return Interval(k, float(low), float(high)), of_bias
 
@@ -195,5 +195,5 @@ def _track(ground_m: Array, turns_rad: Array) -> Interval | None:
     track = float(difference @ turns_rad) / power
     residual = difference - track * turns_rad
     error = math.sqrt(float(np.sum((residual * turns_rad) ** 2))) / power
-    half = float(stats.t.ppf(0.975, max(len(turns_rad) - 1, 1))) * error + 1e-9 * track
+    half = float(scipy.stats.t.ppf(0.975, max(len(turns_rad) - 1, 1))) * error + 1e-9 * track
     return Interval(track, track - half, track + half)

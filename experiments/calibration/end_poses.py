@@ -9,8 +9,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import optimize
 
 from experiments.calibration.end_pose_model import EndPoseMethod, EndPoseModel
 from experiments.calibration.result import CalibrationResult
@@ -158,7 +158,7 @@ def _rough_geometry(
         found = [model.end_without_slip(unknowns[:2], track) for model in models]
         return np.asarray(found - ends).ravel()
 
-    return np.asarray(optimize.least_squares(off, np.zeros(3), bounds=_GEOMETRY).x)
+    return np.asarray(scipy.optimize.least_squares(off, np.zeros(3), bounds=_GEOMETRY).x)
 
 
 def _fisher_scoring(

@@ -3,7 +3,7 @@
 import math
 
 import numpy as np
-from scipy import optimize
+import scipy
 
 from experiments.calibration.logs import Mask, fit_intervals
 from experiments.calibration.reference import LARGEST_DELAY_S, N_PARTS, Reference, Source
@@ -76,7 +76,7 @@ def camera_noise(
     start = np.array([np.median(depth[near] / seen[near, 0]), 0.0, 0.0, 0.0])
     spread = np.array([0.02, 0.02])
     for _ in range(3):
-        fit = optimize.least_squares(
+        fit = scipy.optimize.least_squares(
             weighted, start, loss="soft_l1", x_scale=[0.01] * 4, args=(near, spread)
         )
         found = errors(fit.x)

@@ -3,7 +3,7 @@
 import math
 
 import numpy as np
-from scipy import optimize
+import scipy
 
 from experiments.calibration.logs import slip_law
 from experiments.evaluation.statistics import Interval, share_interval
@@ -94,4 +94,6 @@ def lasting_blocks(alike: float) -> float:
     least, most = 1.0 / _MAX_LASTING, 1e3
     if off(most) >= 0.0:
         return 0.0
-    return 1.0 / float(optimize.brentq(off, least, most)) if off(least) > 0.0 else _MAX_LASTING
+    return (
+        1.0 / float(scipy.optimize.brentq(off, least, most)) if off(least) > 0.0 else _MAX_LASTING
+    )

@@ -28,8 +28,8 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy import optimize, stats
 from scipy.special import ndtr
 
 from experiments.evaluation.statistics import Interval
@@ -67,7 +67,7 @@ def look_errors(looks: tuple[int, ...], spent: float = SPENT) -> tuple[float, ..
     for time, gain in zip(times, np.diff(spent * times**2, prepend=0.0), strict=True):
         step = math.sqrt(time - before)
         bound = float(
-            optimize.brentq(
+            scipy.optimize.brentq(
                 lambda at, place, mass, step, gain: 2.0 * mass @ ndtr((place - at) / step) - gain,
                 0.0,
                 12.0 * math.sqrt(time),
@@ -116,7 +116,7 @@ def skewed_bounds(
         Two-sided.
     """
     count, root = np.asarray(n, float), np.sqrt(np.asarray(n, float))
-    t, skew = stats.t.isf(np.asarray(error) / 2.0, count - 1.0), np.asarray(skewness) / root
+    t, skew = scipy.stats.t.isf(np.asarray(error) / 2.0, count - 1.0), np.asarray(skewness) / root
     scale = np.asarray(deviation, float) / root
     low = -scale * np.maximum(t, _hall(t, skew))
     high = -scale * np.minimum(-t, _hall(-t, skew))
@@ -145,10 +145,12 @@ def power_at(n: int, error: float, effect: float, spread: float) -> float:
     spread
         Standard deviation of the values.
     """
-    return float(stats.norm.sf(stats.norm.isf(error / 2.0) - effect * math.sqrt(n) / spread))
+    return float(
+        scipy.stats.norm.sf(scipy.stats.norm.isf(error / 2.0) - effect * math.sqrt(n) / spread)
+    )
 
 
 def recordings_for(effect: float, spread: float, power: float = 0.9, error: float = 0.05) -> int:
     """Recordings at which a test that looks once has the power; see `power_at`."""
-    z = stats.norm.isf(error / 2.0) + stats.norm.ppf(power)
+    z = scipy.stats.norm.isf(error / 2.0) + scipy.stats.norm.ppf(power)
     return math.ceil(float(spread * z / effect) ** 2)

@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy  # scipy.stats, imported where it is first used, takes a third of a second
 from numpy.typing import ArrayLike
-from scipy import stats
 
 from sim.arrays import Array
 from sim.errors import InputError, require
@@ -35,7 +35,7 @@ def mean_interval(values: ArrayLike, level: float = 0.95) -> Interval:
     if len(sample) < 2 or not math.isfinite(mean):
         return Interval(mean, math.nan, math.nan)
     error = sample.std(ddof=1) / math.sqrt(len(sample))
-    half = float(stats.t.ppf(0.5 + level / 2.0, len(sample) - 1) * error)
+    half = float(scipy.stats.t.ppf(0.5 + level / 2.0, len(sample) - 1) * error)
     return Interval(mean, mean - half, mean + half)
 
 
@@ -43,7 +43,7 @@ def share_interval(hits: int, trials: int) -> Interval:
     """Share of hits with its Clopper-Pearson interval; without bounds for no trial."""
     if trials == 0:
         return Interval(math.nan, math.nan, math.nan)
-    bounds = stats.binomtest(hits, trials).proportion_ci(0.95, "exact")
+    bounds = scipy.stats.binomtest(hits, trials).proportion_ci(0.95, "exact")
     return Interval(hits / trials, float(bounds.low), float(bounds.high))
 
 
@@ -71,9 +71,9 @@ def over_bound(squares: ArrayLike, least: ArrayLike) -> tuple[Interval, float]:
     if not bounds.sum() > 0.0:
         return Interval(math.nan, math.nan, math.nan), math.nan
     ratio, dof = errors.sum() / bounds.sum(), bounds.sum() ** 2 / np.square(bounds).sum()
-    low, high = np.sqrt(ratio * dof / stats.chi2.ppf([0.975, 0.025], dof))
+    low, high = np.sqrt(ratio * dof / scipy.stats.chi2.ppf([0.975, 0.025], dof))
     return Interval(math.sqrt(ratio), float(low), float(high)), float(
-        stats.chi2.cdf(dof * ratio, dof)
+        scipy.stats.chi2.cdf(dof * ratio, dof)
     )
 
 
@@ -96,8 +96,8 @@ def bootstrap_interval(
     if n < 2:
         return Interval(statistic(data) if n else math.nan, math.nan, math.nan)
     values = np.array([statistic(data[rows]) for rows in rng.integers(n, size=(n_resamples, n))])
-    reach = math.sqrt(n / (n - 1)) * stats.t.ppf([0.025, 0.975], n - 1)
-    low, high = np.quantile(values, stats.norm.cdf(reach))
+    reach = math.sqrt(n / (n - 1)) * scipy.stats.t.ppf([0.025, 0.975], n - 1)
+    low, high = np.quantile(values, scipy.stats.norm.cdf(reach))
     return Interval(statistic(data), float(low), float(high))
 
 
@@ -109,7 +109,7 @@ def log_ratio_interval(first: ArrayLike, second: ArrayLike, level: float = 0.95)
 
 def wilcoxon_p(first: ArrayLike, second: ArrayLike) -> float:
     """P of the one-sided signed-rank test that first is below second in paired logs."""
-    return float(stats.wilcoxon(log_ratios(first, second), alternative="less").pvalue)
+    return float(scipy.stats.wilcoxon(log_ratios(first, second), alternative="less").pvalue)
 
 
 def paired_p(differences: ArrayLike) -> float:
@@ -119,7 +119,7 @@ def paired_p(differences: ArrayLike) -> float:
         return math.nan
     if np.ptp(sample) <= 1e-12 * np.abs(sample).max():  # no spread: the same, or surely different
         return float(sample[0] == 0.0)
-    return float(stats.ttest_1samp(sample, 0.0).pvalue)
+    return float(scipy.stats.ttest_1samp(sample, 0.0).pvalue)
 
 
 def holm(p_values: Sequence[float], alpha: float) -> list[bool]:
@@ -135,7 +135,7 @@ def holm(p_values: Sequence[float], alpha: float) -> list[bool]:
 
 def page_trend_p(rows: ArrayLike) -> float:
     """P of Page's test that values (N, K) decrease along the columns."""
-    return float(stats.page_trend_test(-np.asarray(rows, float)).pvalue)
+    return float(scipy.stats.page_trend_test(-np.asarray(rows, float)).pvalue)
 
 
 def log_log_slope(x: ArrayLike, y: ArrayLike) -> float:

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from scipy import stats
+import scipy
 
 from experiments.bench.against import checkout, clone_of, commit_of, git
 from experiments.gate.compare import Change, Finding, by_repeat, compare, failed_runs
@@ -92,7 +92,7 @@ def find_commit(commits: Sequence[str], measure: Measure, only: Sequence[str] = 
             warn(f"{left[middle][:12]}: skipped, {error}")
             skipped.add(left.pop(middle))
             continue
-        p_wrong += float(stats.norm.sf(abs(z)))
+        p_wrong += float(scipy.stats.norm.sf(abs(z)))
         left = left[: middle + 1] if z > 0.0 else left[middle:]
     between = commits[commits.index(left[0]) + 1 : commits.index(left[1])]
     return Blame(left[1], tuple(c for c in between if c in skipped), finding, p_wrong, n_checks)

@@ -25,7 +25,7 @@ from enum import StrEnum
 
 import numpy as np
 import pandas as pd
-from scipy import stats
+import scipy
 
 from experiments.evaluation.statistics import holm, mean_interval
 from experiments.gate.suite import ERRORS
@@ -132,7 +132,7 @@ def _saddle_point_p(sums: Array) -> float:
     above = seen - float(sums.mean(axis=1).sum())
     spread = math.sqrt(float(centred.var(axis=1).sum()))
     if abs(above) <= _NEAR_MEAN * spread:
-        return float(stats.norm.sf(above / spread))
+        return float(scipy.stats.norm.sf(above / spread))
     if above < 0.0:
         return 1.0 - _saddle_point_p(-sums)
     least = -len(sums) * math.log(sums.shape[1])  # log p of what is seen, by itself
@@ -162,7 +162,7 @@ def _saddle_point_p(sums: Array) -> float:
     root, scale = math.sqrt(-2.0 * bound), slope * math.sqrt(max(variance, 0.0))
     if root == 0.0 or scale == 0.0:
         return math.exp(bound)
-    p = float(stats.norm.sf(root) + stats.norm.pdf(root) * (1.0 / scale - 1.0 / root))
+    p = float(scipy.stats.norm.sf(root) + scipy.stats.norm.pdf(root) * (1.0 / scale - 1.0 / root))
     return min(max(p, math.exp(max(least, -700.0))), math.exp(bound))
 
 
@@ -185,7 +185,7 @@ def general_p(differences: Array) -> tuple[float, float]:
     spread = float(differences.std(ddof=1)) / math.sqrt(n)
     if spread == 0.0:
         return float(mean <= 0.0), float(mean >= 0.0)
-    above = float(stats.t.sf(mean / spread, n - 1))
+    above = float(scipy.stats.t.sf(mean / spread, n - 1))
     return above, 1.0 - above
 
 

@@ -28,8 +28,8 @@ from unittest import mock
 
 import numpy as np
 import pandas as pd
+import scipy
 from matplotlib.figure import Figure
-from scipy import stats
 
 from estimators.base import Estimator, Prior
 from experiments.evaluation.statistics import share_interval
@@ -267,12 +267,12 @@ def smallest_detectable(pool: Pool, fault: tuple[str, str]) -> float:
         d = now[:, : entry.repeats[1]].mean(axis=1) - then[:, : entry.repeats[0]].mean(axis=1)
         d, n = d[np.isfinite(d)], pool.suite.counts[entry.recordings]
         spread = float(d.std(ddof=1)) / math.sqrt(n)
-        least = (stats.t.isf(level, n - 1) + stats.norm.ppf(0.95)) * spread
+        least = (scipy.stats.t.isf(level, n - 1) + scipy.stats.norm.ppf(0.95)) * spread
         if entry.repeats[0] > 1:
             own = float(np.nanmean(then.var(axis=1, ddof=1)))
             noise = math.sqrt(own * sum(1.0 / count for count in entry.repeats) / n)
-            real = stats.norm.isf(level) * noise
-            least = max(least, real + stats.norm.ppf(0.95) * spread)
+            real = scipy.stats.norm.isf(level) * noise
+            least = max(least, real + scipy.stats.norm.ppf(0.95) * spread)
         if d.mean() > 0.0:
             found.append(least / float(d.mean()))
     position = worsening(pool.sound[fault[0], ERRORS[0]], of_error[ERRORS[0]])

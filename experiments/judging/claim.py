@@ -10,8 +10,8 @@ from enum import StrEnum
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy import stats
 
 from experiments.evaluation.statistics import (
     Interval,
@@ -204,14 +204,14 @@ def power_of(
     half = (scale(found.high) - scale(found.low)) / 2.0 if math.isfinite(found.low) else math.nan
     if not half > 0.0 or not math.isfinite(half):
         return math.nan
-    z = float(stats.norm.ppf(0.5 + level / 2.0))
-    limit = float(stats.norm.isf(error)) if error else z
+    z = float(scipy.stats.norm.ppf(0.5 + level / 2.0))
+    limit = float(scipy.stats.norm.isf(error)) if error else z
     if all(map(math.isfinite, band)):
         reach = (scale(band[1]) - scale(band[0])) / 2.0
-        return float(max(2.0 * stats.norm.cdf(reach * z / half - limit) - 1.0, 0.0))
+        return float(max(2.0 * scipy.stats.norm.cdf(reach * z / half - limit) - 1.0, 0.0))
     ends = [abs(end) for end in band if math.isfinite(end)]
     size = math.log1p(effect) if is_log else effect * (ends[0] if ends and ends[0] > 1e-6 else 1.0)
-    return float(stats.norm.cdf(size * z / half - limit))
+    return float(scipy.stats.norm.cdf(size * z / half - limit))
 
 
 def effect_in_words(effect: float) -> str:

@@ -10,8 +10,8 @@ from matplotlib.figure import Figure
 from experiments.evaluation.statistics import Interval
 from experiments.judging.free_settings import Anchor, Scale, Setting, snap, units_of
 from experiments.judging.region import Fitted, first_order
-from experiments.viewing.plotting import draw_interval, literal, plain_log, with_legend
-from experiments.viewing.style import BLACK, BLUE, ORANGE, WALL, subplots
+from experiments.viewing.plotting import draw_interval, plain_log, with_legend
+from experiments.viewing.style import BLACK, BLUE, ORANGE, WALL, literal, subplots
 from sim.arrays import Array
 
 _N_GRID = 81

@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+import scipy
 from numpy.typing import NDArray
-from scipy import stats
 
 from experiments.judging.jobs import Tables
 from experiments.judging.results import write_table
@@ -92,7 +92,7 @@ def max_share(n: int, n_differing: int, level: float = 0.95) -> float:
     """
     if n_differing >= n:
         return 1.0
-    return float(stats.beta.ppf(level, n_differing + 1, n - n_differing))
+    return float(scipy.stats.beta.ppf(level, n_differing + 1, n - n_differing))
 
 
 def rows_about(table: pd.DataFrame, words: Iterable[Any]) -> NDArray[np.int64]:

@@ -14,8 +14,8 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 import pandas as pd
+import scipy
 from numpy.typing import NDArray
-from scipy import stats
 
 from experiments.evaluation.sequential import (
     SPENT,
@@ -67,7 +67,7 @@ def mixture_errors(looks: tuple[int, ...], width: float = 4.0) -> Array:
     ratio = (SPENT**2 * share) ** (-1.0 / n)
     with np.errstate(invalid="ignore", divide="ignore"):
         square = np.where(ratio * share < 1.0, (n - 1) * (ratio - 1) / (1 - ratio * share), np.inf)
-    return np.asarray(2.0 * stats.t.sf(np.sqrt(square), n - 1))
+    return np.asarray(2.0 * scipy.stats.t.sf(np.sqrt(square), n - 1))
 
 
 def null_errors(n_claims: int = N_CLAIMS) -> pd.DataFrame:
@@ -103,7 +103,7 @@ def plain_bounds(logs: Array, looks: tuple[int, ...]) -> tuple[Array, Array]:
     """Bounds of the t interval at 95 %."""
     n = np.array(looks)
     first, second = (np.cumsum(logs**k, axis=1)[:, n - 1] / n for k in (1, 2))
-    half = stats.t.ppf(0.975, n - 1) * np.sqrt(np.maximum(second - first**2, 0.0) / (n - 1))
+    half = scipy.stats.t.ppf(0.975, n - 1) * np.sqrt(np.maximum(second - first**2, 0.0) / (n - 1))
     return first - half, first + half
 
 
@@ -156,7 +156,9 @@ def of_claims(n_claims: int = N_CLAIMS // 10) -> pd.DataFrame:
         for name, design in designs(study).items():
             margin = math.log1p(design.effect)
             looks, errors = design.looks, np.array(look_errors(design.looks))
-            z = stats.norm.isf(np.array([0.025, errors[-1] / 2.0])) + stats.norm.ppf(0.9)
+            z = scipy.stats.norm.isf(np.array([0.025, errors[-1] / 2.0])) + scipy.stats.norm.ppf(
+                0.9
+            )
             n_fixed = round(looks[-1] * (z[0] / z[1]) ** 2)  # decides the smallest effect as often
             runs, decided = np.full(n_claims, float(looks[0])), np.ones(n_claims, bool)
             some = judged[judged["id"] == name]

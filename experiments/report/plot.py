@@ -28,8 +28,8 @@ from experiments.sweeps.collect import (
     result_columns,
     with_answers,
 )
-from experiments.viewing.plotting import literal, name_ends, plain_log
-from experiments.viewing.style import SERIES, figure
+from experiments.viewing.plotting import name_ends, plain_log
+from experiments.viewing.style import SERIES, figure, literal
 from sim.errors import InputError, require
 
 _FEW = 8  # values that are ticks of their own

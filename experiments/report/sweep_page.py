@@ -13,8 +13,8 @@ from urllib.parse import quote
 
 import numpy as np
 import pandas as pd
+import scipy
 from markupsafe import Markup
-from scipy import stats
 
 from experiments.report.export import numeric_columns, plain, setting_texts, written
 from experiments.report.page import TEMPLATES, render
@@ -126,7 +126,7 @@ def write_sweep_page(
                 "settings": settings,
                 "metrics": [_metric(every[c], c, place) for c in metrics],
                 "revised": (every[PATH] == "revised").astype(int).tolist(),
-                "t975": stats.t.ppf(0.975, np.arange(1, 200)).round(4).tolist(),
+                "t975": scipy.stats.t.ppf(0.975, np.arange(1, 200)).round(4).tolist(),
                 "called": shlex.quote(name),
                 "options": options,
                 "pictures": pictures,

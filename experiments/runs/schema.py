@@ -1,23 +1,25 @@
-"""What a configuration holds: its keys, and the defaults of what it names."""
+"""What a configuration holds: its keys, the defaults of what it names, and its files' options."""
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from enum import Enum
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
 from pydantic import Field
 
 from estimators.team import Communication
+from experiments.runs.dependencies.recorder import is_recording
 from experiments.runs.paths import CONF
 from sim import sensors
 from sim.errors import InputError, describe_unknown, require
-from sim.options import Count, NonNegative, Option, Positive, described, find, options
+from sim.options import Count, NonNegative, Positive, defaults, described, find, options
 from sim.people.walk import People
 from sim.robot.drive import DifferentialDrive
 
@@ -204,21 +206,21 @@ def _target(settings: DictConfig, place: str) -> Callable[..., Any]:
 def _filled(target: Callable[..., Any], given: Mapping[str, Any]) -> Config:
     """Keys and their values, in the order of the target's own, with its defaults."""
     filled = {"_target_": given["_target_"]} if "_target_" in given else {}
-    for option in _options(target):
-        value = given.get(option.name, _plain(option.default))
-        if dataclasses.is_dataclass(option.default) and isinstance(value, dict):
-            value = _filled(type(option.default), value)
+    for name, default in _defaults(target).items():
+        value = given.get(name, _plain(default))
+        if dataclasses.is_dataclass(default) and isinstance(value, dict):
+            value = _filled(type(default), value)
         if value is not _UNSET:
-            filled[option.name] = value
+            filled[name] = value
     return {**filled, **{name: value for name, value in given.items() if name not in filled}}
 
 
-def _options(target: Callable[..., Any]) -> list[Option]:
-    """Options of what a configuration names; none of what has no signature."""
+def _defaults(target: Callable[..., Any]) -> dict[str, Any]:
+    """Defaults of what a configuration names; none of what has no signature."""
     try:
-        return [option for option in described(target) if option.name not in _INJECTED]
+        return {name: each for name, each in defaults(target).items() if name not in _INJECTED}
     except ValueError:
-        return []
+        return {}
 
 
 def _plain(value: Any) -> Any:
@@ -288,7 +290,8 @@ def describe_option(group: str, name: str, searched: Sequence[str] = ()) -> str:
 
 def _said(target: Callable[..., Any], stated: Mapping[str, Any]) -> Iterator[str]:
     """A line for each option, and one of its meaning."""
-    for option in _options(target):
+    known = _defaults(target)
+    for option in (each for each in (described(target) if known else ()) if each.name in known):
         value = stated.get(option.name, option.default)
         words = {dataclasses.MISSING: "needed", None: "null", True: "true", False: "false"}
         shown = next((said for known, said in words.items() if value is known), value)
@@ -349,3 +352,55 @@ def robot_config(config: Config, settings: TeamSettings, number: int) -> Config:
             raise InputError(describe_unknown(key, own[group], where))
         own[group] = {**own[group], **values}
     return own
+
+
+# What Hydra composes
+
+
+class FromFiles(NamedTuple):
+    """A configuration as Hydra composes it.
+
+    Attributes
+    ----------
+    cfg
+        The configuration, without Hydra's own.
+    choices
+        Name of the chosen option of each group.
+    params
+        `hydra.sweeper.params` of a study's file.
+    """
+
+    cfg: DictConfig
+    choices: Mapping[str, str]
+    params: Mapping[str, str]
+
+
+def compose_files(overrides: Sequence[str], searched: Sequence[str] = ()) -> FromFiles:
+    """Compose a configuration, which takes Hydra 50 ms; it is kept while conf/ is the same.
+
+    While dependencies are recorded, the files are read each time, so that they are seen.
+
+    Parameters
+    ----------
+    searched
+        Overrides that make Hydra look for options elsewhere too; then nothing is kept.
+    """
+    if searched or is_recording():
+        return _composed((*searched, *overrides))
+    files = ((str(path), path.stat()) for path in sorted(CONF.rglob("*.yaml")))
+    state = tuple((name, s.st_mtime_ns, s.st_size, s.st_ino) for name, s in files)
+    kept = _kept(tuple(overrides), state)
+    return kept._replace(cfg=kept.cfg.copy())
+
+
+def _composed(overrides: Sequence[str]) -> FromFiles:
+    cfg = compose("config", overrides=list(overrides), return_hydra_config=True)
+    choices, params = dict(cfg.hydra.runtime.choices), cfg.hydra.sweeper.get("params") or {}
+    OmegaConf.set_struct(cfg, False)
+    del cfg["hydra"]
+    return FromFiles(cfg, choices, dict(params))
+
+
+@functools.lru_cache(maxsize=256)
+def _kept(overrides: tuple[str, ...], _state: tuple[Any, ...]) -> FromFiles:
+    return _composed(overrides)

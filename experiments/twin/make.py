@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy import ndimage
+import scipy
 
 from estimators.base import Prior
 from estimators.graph.graph_slam import GraphSlam
@@ -218,7 +218,7 @@ def _cleared(grid: OccupancyGrid, way: Array, robot: DifferentialDrive) -> Occup
     rows, columns = grid.probability.shape
     on = (cells >= 0).all(axis=1) & (cells < [columns, rows]).all(axis=1)
     passed[cells[on, 1], cells[on, 0]] = False
-    near = ndimage.distance_transform_edt(passed) <= reach + 1.0
+    near = scipy.ndimage.distance_transform_edt(passed) <= reach + 1.0
     return dataclasses.replace(
         grid, probability=np.where(near, np.float32(0.0), grid.probability).astype(np.float32)
     )

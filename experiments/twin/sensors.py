@@ -6,8 +6,8 @@ import dataclasses
 import math
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import optimize
 
 from experiments.calibration.sensor_noise import sightings
 from sim import se2
@@ -105,7 +105,7 @@ def _lasting(times: Array, ids: Array, errors: Array) -> tuple[float, float]:
     def off(unknowns: Array) -> Array:
         return np.asarray(unknowns[0] * np.exp(-_LAGS_S[known] / unknowns[1]) - alike)
 
-    fit = optimize.least_squares(off, [0.5, 2.0], bounds=([0.0, 0.2], [1.0, 60.0]))
+    fit = scipy.optimize.least_squares(off, [0.5, 2.0], bounds=([0.0, 0.2], [1.0, 60.0]))
     return float(fit.x[0]), float(fit.x[1])
 
 

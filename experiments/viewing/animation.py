@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from experiments.evaluation.metrics import CHI2_95_2DOF
 from experiments.viewing.grid import draw_grid
 from experiments.viewing.playback import Playback, RobotTrack, last_row
-from experiments.viewing.plotting import literal, plan_axes
 from experiments.viewing.style import (
     BLACK,
     BLUE,
@@ -24,6 +23,8 @@ from experiments.viewing.style import (
     SKY,
     TRUTH,
     YELLOW,
+    literal,
+    plan_axes,
     subplots,
 )
 from experiments.viewing.team_figure import colour_of, sightings

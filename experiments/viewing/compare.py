@@ -12,8 +12,7 @@ from estimators.base import Estimate
 from experiments.evaluation.metrics import heading_errors_rad, position_errors_m
 from experiments.runs.score import ScoredTrajectory, Scoring, error_table, match_and_align
 from experiments.trajectories.read import read_trajectory
-from experiments.viewing.plotting import plan_axes
-from experiments.viewing.style import CYCLE, TRUTH, figure, save_figure
+from experiments.viewing.style import CYCLE, TRUTH, figure, plan_axes, save_figure
 from experiments.viewing.world import draw_world
 from sim.errors import InputError, require
 from sim.formats.detect import read_any

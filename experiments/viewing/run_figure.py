@@ -13,12 +13,14 @@ from estimators.base import Estimate
 from experiments.evaluation.metrics import position_errors_m, travelled_m
 from experiments.runs.experiment import Experiment
 from experiments.trajectories.convert import write_estimate
-from experiments.viewing.plotting import draw_ellipses, literal, plan_axes
 from experiments.viewing.style import (
     ESTIMATE,
     ORANGE,
     TRUTH,
+    draw_ellipses,
     figure,
+    literal,
+    plan_axes,
     save_figure,
     subplots,
 )

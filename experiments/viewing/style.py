@@ -1,13 +1,21 @@
-"""The style of all figures: size, fonts, and colours that colour-blind people can distinguish."""
+"""The style of all figures: size, fonts, plans, and colours for colour-blind people too.
+
+The picture of a run needs no more, so nothing here imports tables or statistics.
+"""
 
 from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
+import numpy as np
 from cycler import cycler
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.patches import Ellipse
+from numpy.typing import ArrayLike
 
+from experiments.evaluation.metrics import CHI2_95_2DOF
 from experiments.viewing.panels import note_panels
 from sim.errors import require
 from sim.files import write_whole
@@ -57,6 +65,31 @@ def subplots(
     if suptitle:
         page.suptitle(suptitle, size=9)
     return page, page.subplots(n_rows, n_cols, **options)
+
+
+def plan_axes(ax: Axes, **settings: Any) -> None:
+    """Make axes those of a plan in the map frame, in metres."""
+    ax.set(xlabel="x, m", ylabel="y, m", aspect="equal", **settings)
+
+
+def draw_ellipses(
+    ax: Axes, means: ArrayLike, covariances: ArrayLike, label: str = "", **style: Any
+) -> None:
+    """Draw 95 % ellipses at means (N, 2 or more), m, from covariances of x and y, m^2.
+
+    They share one label in the legend.
+    """
+    planes = np.asarray(covariances)[:, :2, :2]
+    for mean, values, vectors in zip(np.asarray(means), *np.linalg.eigh(planes), strict=True):
+        width, height = 2.0 * np.sqrt(CHI2_95_2DOF * np.maximum(values[::-1], 0.0))
+        angle = np.degrees(np.arctan2(vectors[1, 1], vectors[0, 1]))
+        ax.add_patch(Ellipse(mean[:2], width, height, angle=angle, label=label, **style))
+        label = ""
+
+
+def literal(text: str) -> str:
+    """A text of a file as Matplotlib shows it, which reads what is between two $ as mathematics."""
+    return text.replace("$", r"\$")
 
 
 def save_figure(page: Figure, path: Path) -> None:

@@ -9,8 +9,7 @@ from matplotlib.collections import LineCollection
 from numpy.typing import NDArray
 
 from experiments.evaluation.metrics import travelled_m
-from experiments.viewing.plotting import plan_axes
-from experiments.viewing.style import BLACK, PURPLE, SERIES
+from experiments.viewing.style import BLACK, PURPLE, SERIES, plan_axes
 from experiments.viewing.world import draw_walls
 from sim.arrays import Array
 from sim.recording import Recording

@@ -8,7 +8,6 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from experiments.viewing.plotting import plan_axes
 from experiments.viewing.style import (
     BLACK,
     BLUE,
@@ -19,6 +18,7 @@ from experiments.viewing.style import (
     SKY,
     WALL,
     YELLOW,
+    plan_axes,
     subplots,
 )
 from sim.arrays import Array

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import ndimage
+import scipy
 
 from sim.arrays import Array, Bools, Ints
 from sim.errors import require
@@ -59,13 +59,13 @@ class Ground:
         occupied = mark_walls(world.walls[within], low, cell_m, (int(rows), int(columns)))
         starts = np.concatenate([world.start_pose[None, :2], world.waypoints])
         cells = np.floor((starts - low) / cell_m).astype(np.int64)[:, ::-1]
-        rooms, _ = ndimage.label(~occupied)
+        rooms, _ = scipy.ndimage.label(~occupied)
         inside = np.isin(rooms, np.setdiff1d(rooms[cells[:, 0], cells[:, 1]], [0]))
         # A wall lies anywhere in its cell, and a person anywhere in the own one
         clear_m = np.where(inside, cell_m * (clearance(occupied) - math.sqrt(2.0)), -1.0)
         coarse = clear_m.reshape(rows // per_way, per_way, columns // per_way, per_way)
         free = coarse.min(axis=(1, 3)) >= radius_m
-        floors, _ = ndimage.label(free)
+        floors, _ = scipy.ndimage.label(free)
         near = nearest(free, cells // per_way) if free.any() else cells // per_way
         walked = np.isin(floors, np.setdiff1d(floors[near[:, 0], near[:, 1]], [0]))
         require(

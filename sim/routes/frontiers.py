@@ -10,8 +10,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import ndimage, sparse
-from scipy.sparse.csgraph import dijkstra
+import scipy
 
 from sim.arrays import Array, Bools, Ints
 from sim.compiled import njit
@@ -24,22 +23,22 @@ _ALONG = 0.5  # step along them, in cells
 
 def frontiers(free: Mask, unknown: Mask, least_cells: int) -> list[Ints]:
     """Cells (N, 2) of each connected frontier of at least so many cells."""
-    labels, n = ndimage.label(free & adjacent(unknown), np.ones((3, 3)))
+    labels, n = scipy.ndimage.label(free & adjacent(unknown), np.ones((3, 3)))
     groups = [np.argwhere(labels[box] == k + 1) + [part.start for part in box]
-              for k, box in enumerate(ndimage.find_objects(labels, n))]  # fmt: skip
+              for k, box in enumerate(scipy.ndimage.find_objects(labels, n))]  # fmt: skip
     return [cells for cells in groups if len(cells) >= least_cells]
 
 
 def adjacent(mask: Mask) -> Mask:
     """Cells of a mask, and those that share a side with one."""
-    return np.asarray(ndimage.binary_dilation(mask))
+    return np.asarray(scipy.ndimage.binary_dilation(mask))
 
 
 def clearance(occupied: Mask) -> Array:
     """Distance of each cell to the nearest occupied one, in cells; inf if there is none."""
     if not occupied.any():
         return np.full(occupied.shape, np.inf)
-    return np.asarray(ndimage.distance_transform_edt(~occupied))
+    return np.asarray(scipy.ndimage.distance_transform_edt(~occupied))
 
 
 def disc(shape: tuple[int, ...], at: Ints, radius: float) -> Mask:
@@ -135,9 +134,9 @@ class Ways:
             ends.append((numbers[both], there[both], math.hypot(down, right)))
         first, second = (np.concatenate([each[k] for each in ends]) for k in (0, 1))
         lengths = np.concatenate([np.full(len(a), length) for a, _, length in ends])
-        graph = sparse.csr_array((lengths, (first, second)), shape=(len(cells), len(cells)))
+        graph = scipy.sparse.csr_array((lengths, (first, second)), shape=(len(cells), len(cells)))
         near = nearest(passable, starts)
-        found, before = dijkstra(
+        found, before = scipy.sparse.csgraph.dijkstra(
             graph, directed=False, indices=numbers[*near.T], return_predecessors=True
         )
         cost = np.full((len(starts), *passable.shape), np.inf)
@@ -157,5 +156,7 @@ class Ways:
 
 def nearest(mask: Mask, cells: Ints) -> Ints:
     """For each of the cells (N, 2), the nearest (N, 2) that is in the mask."""
-    indices = ndimage.distance_transform_edt(~mask, return_distances=False, return_indices=True)
+    indices = scipy.ndimage.distance_transform_edt(
+        ~mask, return_distances=False, return_indices=True
+    )
     return np.asarray(indices[:, cells[:, 0], cells[:, 1]].T)

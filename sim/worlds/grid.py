@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy import ndimage
+import scipy
 
 from sim import se2
 from sim.arrays import Array, ArrayLike, Bools, Floats, Ints
@@ -149,7 +149,7 @@ def rasterize(world: World, resolution_m: float, z_m: float) -> OccupancyGrid:
     columns, rows = np.ceil((ends.max(axis=0) - corner) / resolution_m) + 2.0
     check_size(rows, columns, f"world {world.name}", "make resolution_m larger")
     occupied = mark_walls(walls, corner, resolution_m, (int(rows), int(columns)))
-    floors, _ = ndimage.label(~occupied)
+    floors, _ = scipy.ndimage.label(~occupied)
     starts = np.concatenate([world.start_pose[None, :2], world.waypoints])
     places = np.floor((starts - corner) / resolution_m).astype(np.int64)
     places = places[np.all((places >= 0) & (places < [columns, rows]), axis=1)]

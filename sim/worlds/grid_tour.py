@@ -1,7 +1,7 @@
 """A tour through a building of which there is only a grid."""
 
 import numpy as np
-from scipy import ndimage
+import scipy
 
 from sim.arrays import Array
 from sim.errors import require
@@ -23,7 +23,7 @@ def plan_tour(grid: OccupancyGrid, stops: int, rng: np.random.Generator) -> Arra
         If there are fewer places.
     """
     wide = clearance(~grid.free) * grid.resolution_m >= _CLEAR_M
-    parts, _ = ndimage.label(wide, np.ones((3, 3)))
+    parts, _ = scipy.ndimage.label(wide, np.ones((3, 3)))
     sizes = np.bincount(parts.ravel())[1:]
     require(
         len(sizes) > 0 and sizes.max() >= stops,

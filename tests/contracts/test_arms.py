@@ -1,7 +1,7 @@
 """What is compared differs in nothing but what is compared: starts, stops, seeds, beliefs."""
 
 import json
-from functools import partial
+from functools import cache, partial
 
 import numpy as np
 import pytest
@@ -40,6 +40,7 @@ def differing(experiments):
     return {key for key in found if not key.startswith("estimator.")}
 
 
+@cache
 def of_one_seed(name):
     return [run for run in plan_experiments([f"study={name}", "seed=1000"]) if run.seed == 1000]
 

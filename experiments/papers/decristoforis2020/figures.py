@@ -16,11 +16,9 @@ from experiments.papers.decristoforis2020.claims import HEADLINES, judged_runs, 
 from experiments.papers.decristoforis2020.settings import CONSISTENT, PAPERS_OWN, PLACES
 from experiments.viewing.plotting import (
     draw_dots,
-    draw_ellipses,
     draw_interval,
     plain_log,
     plain_ticks,
-    plan_axes,
     with_legend,
 )
 from experiments.viewing.style import (
@@ -32,7 +30,9 @@ from experiments.viewing.style import (
     RED,
     SKY,
     TRUTH,
+    draw_ellipses,
     figure,
+    plan_axes,
     subplots,
 )
 from experiments.viewing.world import draw_walls

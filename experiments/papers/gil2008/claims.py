@@ -11,8 +11,8 @@ from dataclasses import replace
 
 import numpy as np
 import pandas as pd
+import scipy
 from numpy.typing import NDArray
-from scipy import stats
 
 from experiments.evaluation.statistics import (
     Interval,
@@ -246,7 +246,7 @@ def _one_drive(repeats: pd.DataFrame) -> Claim:
     """What the paper's own design shows: one drive, with new observations in each run."""
     own = repeats[(repeats["filter"] == "paper") & (repeats["image_draw"] > 0)]
     some, many = (own.loc[own["n_particles"] == n, POSITION].to_numpy() for n in (200, 1000))
-    p = float(stats.ttest_ind(some, many, equal_var=False).pvalue)
+    p = float(scipy.stats.ttest_ind(some, many, equal_var=False).pvalue)
     found = Interval.exact(float(some.mean() / many.mean()))
     said = (
         f"The paper's own design, one drive with {len(some)} runs, shows a ratio of "
@@ -378,7 +378,7 @@ def _divergence(
     found = mean_interval(ekf.astype(float) - fastslam)
     alone, other = int(np.sum(ekf & ~fastslam)), int(np.sum(fastslam & ~ekf))
     n = alone + other
-    p = float(stats.binomtest(alone, n, alternative="greater").pvalue) if n else 1.0
+    p = float(scipy.stats.binomtest(alone, n, alternative="greater").pvalue) if n else 1.0
     label = f"share of runs that diverge, EKF-SLAM less FastSLAM, both by Mahalanobis: {where}"
     verdict = Verdict.UNDECIDED
     if len(ekf) >= 2 and p < 0.01:
@@ -422,7 +422,7 @@ def gi8(cost: pd.DataFrame) -> Iterator[Claim]:
 
 def median_interval(values: Array) -> Interval:
     """Median with its distribution-free interval of at least 95 %."""
-    found = stats.quantile_test(values, p=0.5).confidence_interval(0.95)
+    found = scipy.stats.quantile_test(values, p=0.5).confidence_interval(0.95)
     return Interval(float(np.median(values)), float(found.low), float(found.high))
 
 

@@ -16,14 +16,7 @@ from experiments.judging.results import Arrays, Results
 from experiments.papers.gil2008.claims import HEADLINES, pool_by_world
 from experiments.papers.gil2008.settings import CELL_M
 from experiments.viewing.grid import UNKNOWN, draw_grid
-from experiments.viewing.plotting import (
-    draw_band,
-    draw_ellipses,
-    draw_series,
-    plan_axes,
-    set_axes,
-    with_legend,
-)
+from experiments.viewing.plotting import draw_band, draw_series, set_axes, with_legend
 from experiments.viewing.style import (
     BLACK,
     BLUE,
@@ -35,7 +28,9 @@ from experiments.viewing.style import (
     SKY,
     TRUTH,
     WALL,
+    draw_ellipses,
     figure,
+    plan_axes,
     subplots,
 )
 from experiments.viewing.world import draw_walls

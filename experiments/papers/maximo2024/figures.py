@@ -21,15 +21,19 @@ from experiments.papers.maximo2024.settings import (
     PRINTED_5,
     RECOVERED_WITHIN,
 )
-from experiments.viewing.plotting import (
-    draw_band,
-    draw_dots,
-    plain_log,
+from experiments.viewing.plotting import draw_band, draw_dots, plain_log, set_axes, with_legend
+from experiments.viewing.style import (
+    BLACK,
+    BLUE,
+    CYCLE,
+    GREEN,
+    ORANGE,
+    RED,
+    SKY,
+    WALL,
     plan_axes,
-    set_axes,
-    with_legend,
+    subplots,
 )
-from experiments.viewing.style import BLACK, BLUE, CYCLE, GREEN, ORANGE, RED, SKY, WALL, subplots
 
 _COLOUR = {"M1": ORANGE, "M2": BLUE, "M3": GREEN}
 _FLOOR_M = {"oxford": 1.0, "umh": 0.03, "campus": 0.1}

@@ -1,7 +1,7 @@
 """End poses by the slip as the report models it, and how many of any lie in an ellipse."""
 
 import numpy as np
-from scipy import stats
+import scipy
 
 from experiments.papers.puzzlebot2024.settings import NOMINAL
 from sim.arrays import Array
@@ -30,4 +30,4 @@ def ends_without_lag(
 def count_inside(error: Array, covariance: Array) -> int:
     """How many errors (n, D) lie in the 95 % ellipsoid of a covariance (D, D)."""
     squares = np.sum(error * np.linalg.solve(covariance, error.T).T, axis=1)
-    return int(np.sum(squares <= stats.chi2.ppf(0.95, error.shape[1])))
+    return int(np.sum(squares <= scipy.stats.chi2.ppf(0.95, error.shape[1])))

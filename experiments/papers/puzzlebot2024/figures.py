@@ -15,15 +15,8 @@ from experiments.papers.puzzlebot2024.settings import (
     REPORTED_TURN_RATIO,
     TABLE_1_K_M,
 )
-from experiments.viewing.plotting import (
-    draw_ellipses,
-    draw_table,
-    plain_ticks,
-    plan_axes,
-    set_axes,
-    with_legend,
-)
-from experiments.viewing.style import BLACK, BLUE, CYCLE, ORANGE, subplots
+from experiments.viewing.plotting import draw_table, plain_ticks, set_axes, with_legend
+from experiments.viewing.style import BLACK, BLUE, CYCLE, ORANGE, draw_ellipses, plan_axes, subplots
 
 _METHODS = {
     "wheel_truth": "wheel truth",

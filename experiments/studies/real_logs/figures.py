@@ -15,8 +15,8 @@ from experiments.studies.real_logs.settings import (
     RESOLUTION_M,
 )
 from experiments.viewing.grid import draw_grid
-from experiments.viewing.plotting import plain_log, plan_axes, set_axes, with_legend
-from experiments.viewing.style import BLACK, CYCLE, subplots
+from experiments.viewing.plotting import plain_log, set_axes, with_legend
+from experiments.viewing.style import BLACK, CYCLE, plan_axes, subplots
 from sim.worlds.grid import OccupancyGrid
 
 

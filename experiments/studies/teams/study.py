@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from scipy import stats
+import scipy
 
 from estimators.base import Estimate
 from estimators.landmarks.ekf_slam import EkfSlam
@@ -135,7 +135,7 @@ def uncertainty(own: Recording, online: Estimate) -> tuple[float, float]:
     covariances = online.covariances[:, :2, :2] + 1e-12 * np.eye(2)
     squares = np.sum(off * np.linalg.solve(covariances, off[..., None])[..., 0], axis=1)
     variance = np.trace(covariances, axis1=1, axis2=2).mean()
-    return float(np.mean(squares <= stats.chi2.ppf(0.95, 2))), math.sqrt(float(variance))
+    return float(np.mean(squares <= scipy.stats.chi2.ppf(0.95, 2))), math.sqrt(float(variance))
 
 
 def _arms(size: int, option: str) -> Iterator[tuple[dict[str, Any], Row]]:

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 import pandas as pd
-from scipy import stats
+import scipy
 
 from experiments.evaluation.statistics import (
     Interval,
@@ -96,7 +96,7 @@ def _as_wholes(pairs: pd.DataFrame, others: pd.DataFrame) -> Iterator[Claim]:
 def tw2(pairs: pd.DataFrame) -> Iterator[Claim]:
     """TW2: the order of the estimators by the twin's medians is that of the log's errors."""
     taus = {
-        log: float(stats.kendalltau(rows.median_m, rows.error_m).statistic)
+        log: float(scipy.stats.kendalltau(rows.median_m, rows.error_m).statistic)
         for log, rows in pairs.groupby("log", sort=False)
     }
     judged = [tau for log, tau in taus.items() if log not in SHOWN and np.isfinite(tau)]

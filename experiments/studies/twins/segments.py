@@ -5,6 +5,8 @@ prediction is the mean distance of its draws to what comes, less half of that am
 (Gneiting and Raftery 2007, eq. (21)); it is lowest for the true distribution.
 """
 
+import functools
+
 import numpy as np
 import pandas as pd
 
@@ -43,12 +45,19 @@ def score_segments(segments: pd.DataFrame) -> pd.DataFrame:
     known = segments.dropna(subset="error_m")
     real, simulated = known[known.seed < 0], known[known.seed >= 0]
     draws = {key: part.error_m.to_numpy() for key, part in simulated.groupby(_KEYS)}
+
+    @functools.cache
+    def of_other_logs(log: str, kind: str, method: str) -> tuple[Array, Array]:
+        """Errors of their twins, and their real ones."""
+        alike = (known.kind == kind) & (known.method == method) & (known.log != log)
+        errors, simulated = known.error_m[alike].to_numpy(), known.seed[alike].to_numpy() >= 0
+        return errors[simulated], errors[~simulated]
+
     rows = []
     for row in real.itertuples():
         own = draws.get((row.log, row.kind, row.method, row.segment))
-        alike = (known.kind == row.kind) & (known.method == row.method) & (known.log != row.log)
-        others, past = known[alike & (known.seed >= 0)], known[alike & (known.seed < 0)]
-        if own is None or len(own) < 2 or past.empty:
+        others, past = of_other_logs(row.log, row.kind, row.method)
+        if own is None or len(own) < 2 or not len(past):
             continue
         low, high = np.quantile(own, [0.025, 0.975])
         again = [crps(np.delete(own, i), value) for i, value in enumerate(own)]
@@ -58,8 +67,8 @@ def score_segments(segments: pd.DataFrame) -> pd.DataFrame:
                 "error_m": row.error_m,
                 "inside": bool(low <= row.error_m <= high),
                 "crps_own": crps(own, row.error_m),
-                "crps_others": crps(others.error_m.to_numpy(), row.error_m),
-                "crps_climatology": crps(past.error_m.to_numpy(), row.error_m),
+                "crps_others": crps(others, row.error_m),
+                "crps_climatology": crps(past, row.error_m),
                 "crps_right": float(np.mean(again)),
             }
         )

@@ -25,7 +25,7 @@ from sim.team import Team
 from tests.fixtures.fakes import circle
 
 ROOT = Path(__file__).resolve().parents[3]
-QUICK = ["simulation.physics=kinematic", "simulation.rays=exact"]
+QUICK = ["simulation.physics=kinematic", "simulation.rays=exact", "picture=false"]
 
 
 def estima(*arguments, cwd=ROOT, **environment):
@@ -40,7 +40,7 @@ def estima(*arguments, cwd=ROOT, **environment):
 
 
 def called(*arguments):
-    """As `estima`, in this process: for what neither runs nor leaves anything."""
+    """As `estima`, in this process: for what does not depend on having one of its own."""
     out, err = io.StringIO(), io.StringIO()
     with (
         mock.patch.object(sys, "argv", ["estima", *arguments]),
@@ -112,10 +112,12 @@ def test_options_describes_an_option_of_ones_own_folder(tmp_path):
 
 def test_a_run_prints_its_errors_and_leaves_a_row(tmp_path):
     place = {"ESTIMA_RESULTS": str(tmp_path / "mine")}
-    done = estima("run", *QUICK, "seed=12", "name=test_cli", cwd=tmp_path, **place)
+    done = estima("run", *QUICK, "picture=true", "seed=12", "name=test_cli", cwd=tmp_path, **place)
     assert done.returncode == 0, done.stderr
     assert "position RMSE" in done.stdout
-    frame = read_runs(tmp_path / "mine" / "runs" / "test_cli")
+    rows = tmp_path / "mine" / "runs" / "test_cli"
+    frame = read_runs(rows)
+    assert [path.parent.parent for path in rows.rglob("run.png")] == [rows]
     assert frame["status"].tolist() == ["ok"]
     assert frame["robot.kr"].tolist() == [1e-5]
     assert np.isfinite(frame["ate_rmse_m"]).all()
@@ -229,9 +231,9 @@ def test_an_unknown_key_of_a_sweep_names_the_known_ones(argument):
     refused(called("run", "-m", *QUICK, argument), "unknown key robot.kq", "robot.kr")
 
 
-def test_a_sweep_with_a_bad_value_runs_nothing(tmp_path):
-    done = estima("run", "-m", *QUICK, "estimator.kr=1e-5,-1", ESTIMA_RESULTS=str(tmp_path))
-    refused(done, "estimator.kr", "-1")
+def test_a_sweep_with_a_bad_value_runs_nothing(tmp_path, monkeypatch):
+    monkeypatch.setenv("ESTIMA_RESULTS", str(tmp_path))
+    refused(called("run", "-m", *QUICK, "estimator.kr=1e-5,-1"), "estimator.kr", "-1")
     assert not list(tmp_path.iterdir())
 
 
@@ -282,13 +284,13 @@ def test_a_malformed_option_names_its_file(tmp_path):
 
 def test_damaged_recordings_are_refused(tmp_path):
     path = tmp_path / "r.npz"
-    assert estima("record", "-o", str(path), *QUICK, "route=linear_1").returncode == 0
-    assert "frames" in estima("info", str(path)).stdout
-    believed = estima("run", *QUICK, f"recording={path}", "name=test_cli", "picture=false")
+    assert called("record", "-o", str(path), *QUICK, "route=linear_1").returncode == 0
+    assert "frames" in called("info", str(path)).stdout
+    believed = called("run", *QUICK, f"recording={path}", "name=test_cli")
     assert "robot.kr" not in believed.stderr
     assert f"odometry on {path}" in believed.stdout
-    other = ["robot=robocom", "estimator.kr=1e-5", "name=test_cli", "picture=false"]
-    believed = estima("run", *QUICK, f"recording={path}", *other)
+    other = ["robot=robocom", "estimator.kr=1e-5", "name=test_cli"]
+    believed = called("run", *QUICK, f"recording={path}", *other)
     assert "was made with robot.kr=1e-05" in believed.stderr
     path.write_bytes(path.read_bytes()[:-100])
     refused(called("info", str(path)), "r.npz", "record again")
@@ -308,9 +310,9 @@ def test_calibration_from_recordings(tmp_path):
     for seed in range(3):
         path = tmp_path / f"{seed}.npz"
         overrides = ["route=linear_2", f"seed={seed}", "robot.kr=1e-4", "robot.kl=5e-5"]
-        assert estima("record", "-o", str(path), *QUICK, *overrides, "world=empty").returncode == 0
+        assert called("record", "-o", str(path), *QUICK, *overrides, "world=empty").returncode == 0
         paths.append(str(path))
-    done = estima("calibrate", *paths, "--json")
+    done = called("calibrate", *paths, "--json")
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)
     assert found["kr"]["low"] < 1e-4 < found["kr"]["high"]
@@ -333,13 +335,13 @@ def test_calibration_from_a_sheet():
 
 def test_view_draws_a_world(tmp_path):
     out = tmp_path / "w.png"
-    done = estima("view", "--world", "world=corridor", "-o", str(out))
+    done = called("view", "--world", "world=corridor", "-o", str(out))
     assert done.returncode == 0, done.stderr
     assert out.read_bytes()[:4] == b"\x89PNG"
 
 
 def test_conform_runs_by_name():
-    done = estima("conform", "estimators.odometry:Odometry", "kr=1e-5", "kl=1e-5")
+    done = called("conform", "estimators.odometry:Odometry", "kr=1e-5", "kl=1e-5")
     assert done.returncode == 0, done.stdout + done.stderr
     assert done.stdout.count("pass") >= 8
 

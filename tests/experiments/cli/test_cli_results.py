@@ -39,7 +39,7 @@ def test_the_command_shows_and_clears(folder, tmp_path):
 
 @pytest.mark.parametrize("after", [False, True])
 def test_results_go_to_the_folder_of_the_option(tmp_path, after):
-    run = ["run", *QUICK, "route=linear_1", "name=moved", "picture=false"]
+    run = ["run", *QUICK, "route=linear_1", "name=moved"]
     option = ["--results", "there"]
     arguments = [*run, *option] if after else [*option, *run]
     done = estima(*arguments, cwd=tmp_path, ESTIMA_RESULTS="elsewhere")

@@ -3,6 +3,7 @@
 import shutil
 import sys
 import time
+from importlib import metadata
 
 import pytest
 
@@ -268,3 +269,11 @@ def test_the_interpreter_of_a_command_is_not_a_file_it_depends_on(tmp_path):
     script = tmp_path / "method.py"
     script.write_text("")
     assert list(_command_digests(sys.executable, (str(script),), None)) == [str(script)]
+
+
+def test_a_package_has_the_version_of_its_distribution():
+    """As the standard library finds it, which takes longer."""
+    by_module = metadata.packages_distributions()
+    for module in ("hydra", "yaml", "PIL", "dateutil", "antlr4", "six", "numpy"):
+        assert digests.package_version(module) == metadata.version(by_module[module][0])
+    assert digests.package_version("no_such_module") is None

@@ -1,5 +1,6 @@
 """Claims TW1 and TW2: tables that pass, and tables that fail."""
 
+import functools
 import itertools
 
 import numpy as np
@@ -33,6 +34,7 @@ def runs(errors=None, spread=0.25, n=50):
     return pd.DataFrame(rows)
 
 
+@functools.cache
 def minutes(spread=0.3, shift=1.0, own_scale=3.0, n=60, n_minutes=60):
     """Errors over minutes: the log's own scale, and what its twin draws of them."""
     rng = np.random.default_rng(0)

@@ -259,7 +259,7 @@ def test_a_sweep_that_has_not_ended_says_so(name, monkeypatch, capsys):
 
 @pytest.mark.slow
 def test_values_that_no_column_holds_fail_alone(name):
-    done = estima("run", "-m", *ALONE, "seed=1,2,99999999999999999999999", f"name={name}",
+    done = called("run", "-m", *ALONE, "seed=1,2,99999999999999999999999", f"name={name}",
                   "world.n_objects=6,6.5")  # fmt: skip
     assert done.returncode == 1, done.stderr
     assert "Traceback" not in done.stderr
@@ -269,9 +269,9 @@ def test_values_that_no_column_holds_fail_alone(name):
     assert (rows["status"] == "ok").sum() == 3
     out = folder(name).parent / f"{name}.csv"
     try:
-        assert estima("table", name, "--rows", "-o", str(out)).returncode == 0
+        assert called("table", name, "--rows", "-o", str(out)).returncode == 0
         assert len(read_rows(out)) == 6
-        plotted = estima("plot", name, "--x", "seed", "-o", str(out.with_suffix(".xyz")))
+        plotted = called("plot", name, "--x", "seed", "-o", str(out.with_suffix(".xyz")))
         assert plotted.returncode == 2
         assert "3 of 6 runs failed" in plotted.stderr
         assert "a picture is .png" in plotted.stderr
@@ -298,11 +298,11 @@ def test_a_sweep_without_a_name_has_one_of_its_own(tmp_path):
 @pytest.mark.slow
 def test_files_that_are_not_the_runs_rows(name):
     swept_ = ["run", "-m", *ALONE, "seed=0,1,2", f"name={name}"]
-    assert estima(*swept_).returncode == 0
+    assert called(*swept_).returncode == 0
     expected = table_of(name)
     first, second, *_ = sorted(folder(name).glob("*.parquet"))
     first.write_bytes(second.read_bytes())
-    again = estima(*swept_)
+    again = called(*swept_)
     assert f"{first} does not match its checksum; its runs are done again" in again.stderr
     assert again.returncode == 0, again.stderr
     pd.testing.assert_frame_equal(table_of(name), expected, check_exact=True)

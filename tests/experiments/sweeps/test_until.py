@@ -13,7 +13,7 @@ from experiments.sweeps.launch import sweep
 from experiments.sweeps.plan import make_plan
 from experiments.sweeps.until import DECIDED, Until, read_decided
 from sim.errors import InputError
-from tests.experiments.cli.test_cli import estima, refused
+from tests.experiments.cli.test_cli import called, refused
 from tests.experiments.sweeps.conftest import ALONE, SHORT, folder, table_of
 
 ARMS = "estimator.window_s=0.1,0.2,0.3"
@@ -161,7 +161,7 @@ def test_the_best_of_equal_arms_is_hardly_ever_dropped():
     rng, wrong = np.random.default_rng(0), 0
     looks = until.plan_looks(60, until.FIRST_LOOK)
     interval = functools.partial(until.repeated_interval, looks=looks, spent=until.SPENT / 4)
-    n_sweeps, names = 400, dict(enumerate("abcde"))
+    n_sweeps, names = 200, dict(enumerate("abcde"))
     for _ in range(n_sweeps):
         logs = pd.DataFrame(rng.normal(0.0, 0.3, size=(60, 5)))
         alive, lost = set(range(5)), set()
@@ -205,7 +205,7 @@ def test_a_damaged_record_is_named(tmp_path):
 
 
 def test_against_goes_with_a_sweep():
-    done = estima("run", "--against", "odometry")
+    done = called("run", "--against", "odometry")
     refused(done, "--against odometry: goes with -m and until=decided")
 
 
@@ -214,7 +214,7 @@ def test_a_sweep_ends_when_it_is_decided_and_goes_on_where_it_was(name):
     arguments = ["run", "-m", *ALONE, "route=angular_4", "estimator=odometry",
                  "prior.track_m=0.19,0.3", "seed=range(0,20)", "until=decided:heading_rmse_rad",
                  f"name={name}"]  # fmt: skip
-    done = estima(*arguments)
+    done = called(*arguments)
     assert done.returncode == 0, done.stderr
     assert "at most 40 runs, 0 of them done before" in done.stderr
     assert "prior.track_m=0.19 is the best" in done.stdout
@@ -223,9 +223,9 @@ def test_a_sweep_ends_when_it_is_decided_and_goes_on_where_it_was(name):
     )
     assert len(table_of(name)) == 24
     before = (folder(name) / DECIDED).read_text()
-    again = estima(*arguments)
+    again = called(*arguments)
     assert "24 of them done before" in again.stderr
     assert (folder(name) / DECIDED).read_text() == before
-    whole = estima(*[a for a in arguments if not a.startswith("until")])  # adds what is missing
+    whole = called(*[a for a in arguments if not a.startswith("until")])  # adds what is missing
     assert whole.returncode == 0
     assert len(table_of(name)) == 40
