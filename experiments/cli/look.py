@@ -97,7 +97,9 @@ def _group_of(name: str, config_dir: Path | None) -> str:
     groups = _groups_of(name, config_dir)
     options = [n for g in completion.GROUPS for n in completion.options(g, config_dir)]
     known = [*completion.GROUPS, "metrics", *options]
-    require(groups, f"no group or option {name}; {nearest(name, known)}")
+    listed = nearest(name, known)
+    remedy = "; `estima options` lists all" if listed.endswith(" more") else ""
+    require(groups, f"no group or option {name}; {listed}{remedy}")
     several = " or ".join(f"`estima options {group} {name}`" for group in groups)
     require(len(groups) == 1, f"{name} is an option of several groups: {several}")
     return groups[0]
