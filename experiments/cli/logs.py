@@ -31,10 +31,13 @@ def info(
     warns, a line each, of gaps, repeated and coarse stamps, delays between wheels and sensors,
     gains, and ranges of a wrong scale.
     """
+    from experiments.runs.logs import say_choice
     from experiments.viewing.describe import describe
     from sim.formats.detect import read_all
 
     robots = read_all(log, robot).robots
+    if robot is None:
+        say_choice(log[0], robots[0], by_flag=True)
     require(len(robots) == 1 or not check, "--check takes one robot; choose it with --robot")
     for number, own in enumerate(robots):
         show(describe(own) if len(robots) == 1 else f"robot {number}\n{describe(own)}\n")
@@ -281,12 +284,12 @@ def twin(
 
       estima run study=fr079.yaml estimator=ekf_icp recording=fr079_log.npz (what the log shows)
     """
+    from experiments.runs.logs import read_log
     from experiments.twin.make import make_twin
     from experiments.twin.write import check_name, write_twin
-    from sim.formats.detect import read_any
 
     check_name(out)
-    made = make_twin(read_any(log, robot), split_s)
+    made = make_twin(read_log(log, robot), split_s)
     show(made.found.as_text())
     for path in write_twin(made, out):
         show(paths.short(path))

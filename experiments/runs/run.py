@@ -56,6 +56,10 @@ def run_once(experiment: Experiment, draw: Draw, out: Path | None = None) -> lis
     def fetch() -> Team:
         with shown("simulated seconds", expected_duration_s(experiment)) as on_progress:
             read = experiment.recordings(on_progress)
+        if experiment.is_read and experiment.team is None:
+            from experiments.runs.logs import say_choice  # here: only a log needs the readers
+
+            say_choice(Path(experiment.config["recording"]), read.only)
         slip = experiment.believed_slip
         if (
             len(read) == 1
@@ -107,6 +111,11 @@ def run_once(experiment: Experiment, draw: Draw, out: Path | None = None) -> lis
     if found and experiment.config["picture"]:
         _draw(draw, found, experiment, folder)
     _print(rows, [file for file in written if file is not None and file.exists()])
+    if found and all(recording.truth is None for recording, _ in found):
+        show(
+            "  no error: the recording has no true path; `estima convert LOG --truth PATH.tum -o "
+            "run.npz` gives it one, `estima score --relations FILE` needs only true relations"
+        )
     for row in rows:
         if row["status"] == Outcome.FAILED:
             raise RunFailedError(f"{row['status_code']}: {row['status_detail']}")
