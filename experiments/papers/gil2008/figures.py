@@ -20,6 +20,7 @@ from experiments.viewing.plotting import (
     draw_band,
     draw_ellipses,
     draw_series,
+    name_ends,
     plan_axes,
     set_axes,
     with_legend,
@@ -266,7 +267,7 @@ def by_particles(repeats: pd.DataFrame, bound: pd.DataFrame) -> Figure:
     set_axes(grid[-1], xlabel="particles M")
     n_runs = len(repeats[drawn]) // repeats.groupby(["filter", "n_particles"]).ngroups
     page.suptitle(
-        f"one drive, {n_runs} runs each, bars of two standard deviations; "
+        f"one drive, {n_runs} runs each; bars: two standard deviations, cut at zero; "
         f"RMS error of odometry: {repeats['odometry_rmse_m'][0]:.1f} m"
     )
     return with_legend(page, ncols=4)
@@ -326,7 +327,9 @@ def by_distance(distance: pd.DataFrame) -> Figure:
         ax.axvline(10.0, color=BLACK, lw=0.6, ls=":")
         words = "farthest distance of an observation (dmax), m"
         set_axes(ax, xlabel=words, ylabel=label, plain="y")
-    return with_legend(page, ncols=1, loc="outside right center")
+    drawn = {str(one.get_label()): one for one in ax.get_lines() if one.get_marker() == "o"}
+    name_ends(page, ax, drawn)
+    return page
 
 
 def by_observations(observations: pd.DataFrame) -> Figure:
