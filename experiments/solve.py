@@ -33,10 +33,9 @@ from experiments.evaluation.metrics import SCORED_EXTRAS, path_scores, travelled
 from experiments.evaluation.relations import relation_scores
 from experiments.report.page import render
 from experiments.runs.calibration import write_calibration
-from experiments.runs.console import progress, show
+from experiments.runs.console import progress, read_log, show
 from experiments.runs.evaluate import WARNED_SHARE, run_over, status_of
 from experiments.runs.experiment import Experiment
-from experiments.runs.logs import read_log
 from experiments.runs.processes import hold_interrupts
 from experiments.runs.row import Row
 from experiments.runs.seeds import stream
@@ -388,7 +387,7 @@ def as_text(row: Mapping[str, Any], out: Path) -> str:
         lines.append(f"truth       {row['ate_aligned_rmse_m']:.4f} m RMS, aligned")
     elif "n_relations" not in row:
         lines.append(
-            "no error    the log has no true path; --relations FILE judges the answer, and so does "
-            "`estima convert LOG --truth PATH.tum -o run.npz`, then `estima solve run.npz`"
+            "no error    the log has no true path; give relations, or add a path from a file by "
+            "`estima convert` and solve what it writes (docs/do/solve.md)"
         )
     return "\n".join([*lines, str(out / "page.html")])

@@ -14,8 +14,8 @@ from experiments.calibration.sheet import calibrate_sheet
 from experiments.calibration.slip import BLOCK_S
 from experiments.runs.calibration import write_calibration
 from experiments.runs.compose import searched
+from experiments.runs.console import read_log
 from experiments.runs.experiment import Experiment
-from experiments.runs.logs import read_log
 from experiments.viewing.style import BLACK, BLUE, save_figure, subplots
 from sim.arrays import Array
 from sim.errors import require

@@ -11,7 +11,7 @@ import typer
 
 from experiments.cli.flags import ConfigDir, Log, WhichRobot, gathered
 from experiments.runs import paths
-from experiments.runs.console import show
+from experiments.runs.console import read_log, say_choice, show
 from sim.errors import require
 
 
@@ -31,7 +31,6 @@ def info(
     warns, a line each, of gaps, repeated and coarse stamps, delays between wheels and sensors,
     gains, and ranges of a wrong scale.
     """
-    from experiments.runs.logs import say_choice
     from experiments.viewing.describe import describe
     from sim.formats.detect import read_all
 
@@ -284,7 +283,6 @@ def twin(
 
       estima run study=fr079.yaml estimator=ekf_icp recording=fr079_log.npz (what the log shows)
     """
-    from experiments.runs.logs import read_log
     from experiments.twin.make import make_twin
     from experiments.twin.write import check_name, write_twin
 

@@ -11,7 +11,7 @@ import typer
 from experiments.cli import completion
 from experiments.cli.flags import ConfigDir, Overrides
 from experiments.runs import columns, paths
-from experiments.runs.console import no_option, show
+from experiments.runs.console import no_option, progress, show
 from sim.errors import nearest, require
 from sim.files import read_text
 
@@ -121,7 +121,8 @@ def recommend(
     """
     from experiments.report.recommend import SURE, recommend
 
-    advice = recommend(overrides or [])
+    with progress("comparing estimators", 1.0) as on_progress:
+        advice = recommend(overrides or [], on_progress)
     show(
         f"{advice.text}\n\nTo be sure, run the best in your own setting:\n"
         f"  {shlex.join(['estima', 'run', '-m', *advice.sweep])}\n"

@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from experiments.evaluation.time_sync import interpolate
-from experiments.runs.console import progress
-from experiments.runs.logs import read_log
+from experiments.runs.console import progress, read_log
 from experiments.viewing.estimates import check_no_overrides, estimate_along
 from experiments.viewing.grid import describe_grid
 from sim.arrays import Array

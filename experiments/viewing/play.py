@@ -7,9 +7,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from experiments.runs import paths
-from experiments.runs.console import enumerate_words, progress
+from experiments.runs.console import enumerate_words, progress, say_choice
 from experiments.runs.experiment import Experiment
-from experiments.runs.logs import say_choice
 from experiments.viewing import live, movie
 from experiments.viewing.estimates import OnStep, with_all_estimates
 from experiments.viewing.grid import grid_figure

@@ -90,7 +90,9 @@ def test_a_log_without_a_truth_says_that_its_error_is_unknown(solved):
     row = json.loads((solved[1] / "summary.json").read_text())
     assert "no error" not in as_text(row, solved[1])
     unjudged = {k: v for k, v in row.items() if k not in ("n_relations", "ate_aligned_rmse_m")}
-    assert "no error    the log has no true path; --relations FILE" in as_text(unjudged, solved[1])
+    assert "no error    the log has no true path; give relations, or" in as_text(
+        unjudged, solved[1]
+    )
 
 
 def test_an_interrupt_says_that_nothing_is_kept(tmp_path, monkeypatch):

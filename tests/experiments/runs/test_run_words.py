@@ -139,7 +139,9 @@ def test_a_run_without_a_truth_says_why_there_is_no_error(tmp_path, monkeypatch,
         own = [f"recording={tmp_path / name}.npz", "estimator=odometry", "name=blind"]
         run_once(Experiment.compose([*QUICK, *own, "picture=false"]), lambda *_: None)
         said = capsys.readouterr().out
-        assert ("no error: the recording has no true path; `estima convert" in said) is is_said
+        assert (
+            "no error: the recording has no true path; `estima convert` adds one" in said
+        ) is is_said
 
 
 def test_the_next_command_has_each_key_once(tmp_path):
