@@ -111,8 +111,8 @@ def run_once(experiment: Experiment, draw: Draw, out: Path | None = None) -> lis
     _print(rows, [file for file in written if file is not None and file.exists()])
     if found and all(recording.truth is None for recording, _ in found):
         show(
-            "  no error: the recording has no true path; `estima convert` adds one from a file, and "
-            "`estima score` can judge by relations instead (docs/do/solve.md)"
+            "  no error: the recording has no true path; `estima convert` adds one from a file, or "
+            "`estima score` judges by relations (docs/do/solve.md)"
         )
     for row in rows:
         if row["status"] == Outcome.FAILED:
