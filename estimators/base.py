@@ -375,16 +375,19 @@ class Journal:
             self._means[i], self._covariances[i] = read_belief(belief, self._who)
         except BeliefError as error:
             require(i > 0, str(error))
-            raise BeliefError(f"{error}, at {frame.stamp:.2f} s, step {i}") from error
+            raise BeliefError(f"{error}, at {self._since_start(i)}, step {i}") from error
         self._seconds[i] = seconds
         for name, values in self._extras.items():
             values.append(belief.extras.get(name))
         if self._status == "ok" and belief.extras.get("status", "ok") != "ok":
             said = one_line(str(belief.extras["status"]))
-            self._status = f"{said} at {frame.stamp:.2f} s"
+            self._status = f"{said} at {self._since_start(i)}"
         self._n_noted = i + 1
         if self._on_step is not None:
             self._on_step(i + 1)
+
+    def _since_start(self, step: int) -> str:
+        return since_start(self._stamps, step)
 
     def estimate(self) -> Estimate:
         """Online estimate of what was noted."""
@@ -397,6 +400,17 @@ class Journal:
             extras=self._extras,
             status=self._status,
         )
+
+
+def since_start(stamps: Sequence[float] | Array, step: int) -> str:
+    """When a step is, in seconds after the first stamp: a log's own clock says nothing to a reader.
+
+    Examples
+    --------
+    >>> since_start(np.array([976052857.0, 976052891.65]), 1)
+    '34.65 s'
+    """
+    return f"{stamps[step] - stamps[0]:.2f} s"
 
 
 def read_belief(belief: Any, who: str) -> tuple[Array, Array]:
@@ -440,5 +454,5 @@ def explain_unsound(estimate: Estimate) -> str:
         faulty = ~sound if estimate.status == "ok" else ~sound & given
         if faulty.any():
             step = int(np.argmax(faulty))
-            return f"the {fault} at {stamps[step]:.2f} s, step {step}"
+            return f"the {fault} at {since_start(stamps, step)}, step {step}"
     return ""

@@ -25,7 +25,7 @@ from experiments.judging.claims_file import (
     write_claims,
     write_verdicts,
 )
-from experiments.judging.folders import LOGS, OWN, STUDIES, findings
+from experiments.judging.folders import LOGS, OWN, STUDIES, SWEEPS, findings
 from experiments.judging.folders import part as _part
 from experiments.judging.jobs import in_parallel
 from experiments.judging.logs import why_missing
@@ -91,7 +91,7 @@ def _again(place: Path, study: str) -> tuple[int, list[Conclusion], list[Claim]]
     """Draw a study's figures and judge its claims from its tables; the number of figures."""
     made = Results(place, study)
     with made.blaming_files():
-        n_figures = _draw(made)
+        n_figures = len(_draw(made))
         claims, conclusions = ([], []) if study in OWN else judgement(made)
     return n_figures, conclusions, claims
 
@@ -178,13 +178,14 @@ def redraw(only: str | None = None) -> None:
         If there are none, or they are damaged.
     """
     place = results()
-    present = [p for p in _chosen(only) if any((place / "tables").glob(f"{p}_*.csv"))]
+    chosen = _chosen(only, (*STUDIES, *SWEEPS))
+    present = [p for p in chosen if any((place / "tables").glob(f"{p}_*.csv"))]
     if not present:
         raise InputError(
             f"{short(place / 'tables')}: no tables of {only or 'any paper'}; "
             f"run `{reproduce_command(only)}`"
         )
-    for paper in _chosen(only):
+    for paper in chosen:
         begun = time.monotonic()
         if paper not in present:
             warn(f"{paper}: left out, no tables in {short(place)}")
@@ -263,10 +264,9 @@ def _drawn_items(made: Results) -> Items:
     """Draw a study's figures; what each depends on, and the seconds that all took."""
     begun = time.monotonic()
     with recorded(_part(made.paper, "figures").__name__) as seen:
-        _draw(made)
+        names = _draw(made)
     found = dependencies_of(seen, made.folder), time.monotonic() - begun
-    paths = sorted((made.folder / "figures").glob(f"{made.paper}_*"))
-    return {f"figures/{path.name}": found for path in paths}
+    return {f"figures/{name}.png": found for name in names}
 
 
 def _judged_items(made: Results) -> tuple[Items, list[Claim], list[Conclusion]]:
@@ -298,13 +298,13 @@ def _write(
     write_verdicts(conclusions, place / "verdicts.csv", paper=paper, says=says, profile=profile)
 
 
-def _draw(made: Results) -> int:
-    """Draw a study's figures; return how many there are."""
+def _draw(made: Results) -> list[str]:
+    """Draw a study's figures; return their names."""
     with limit_blas():
         pages = _part(made.paper, "figures").draw(made)
     for title, page in pages.items():
         save_figure(page, made.folder / "figures" / f"{title}.png")
-    return len(pages)
+    return sorted(pages)
 
 
 def _put_in_place(new: Path, old: Path, paper: str) -> None:
@@ -324,10 +324,12 @@ def _put_in_place(new: Path, old: Path, paper: str) -> None:
         ) from error
 
 
-def _chosen(only: str | None) -> tuple[str, ...]:
-    if only is not None and only not in STUDIES:
-        raise InputError(f"no paper or study named {only}; {nearest(only, STUDIES)}")
-    return STUDIES if only is None else (only,)
+def _chosen(only: str | None, known: tuple[str, ...] = STUDIES) -> tuple[str, ...]:
+    if only in SWEEPS and only not in known:
+        raise InputError(f"{only} is a sweep; `estima run -m study={only}` makes it again")
+    if only is not None and only not in known:
+        raise InputError(f"no paper or study named {only}; {nearest(only, known)}")
+    return known if only is None else (only,)
 
 
 def first_sentence(text: str) -> str:

@@ -33,7 +33,7 @@ from experiments.evaluation.metrics import SCORED_EXTRAS, path_scores, travelled
 from experiments.evaluation.relations import relation_scores
 from experiments.report.page import render
 from experiments.runs.calibration import write_calibration
-from experiments.runs.console import progress, show
+from experiments.runs.console import progress, read_log, show
 from experiments.runs.evaluate import WARNED_SHARE, run_over, status_of
 from experiments.runs.experiment import Experiment
 from experiments.runs.processes import hold_interrupts
@@ -46,7 +46,6 @@ from sim import se2
 from sim.arrays import Array
 from sim.errors import InputError, require
 from sim.files import write_text
-from sim.formats.detect import read_any
 from sim.formats.relations import Relations, read_relations
 from sim.formats.tum import write_tum
 from sim.recording import Recording, save
@@ -125,7 +124,7 @@ def solve_log(
     """
     require(not out.exists() or out.is_dir(), f"{out}: is a file; name a folder")
     begun = time.monotonic()
-    recording = read_any(log, robot)
+    recording = read_log(log, robot)
     judged = None if relations is None else read_relations(relations)
     left = "is not written"
     try:
@@ -386,4 +385,9 @@ def as_text(row: Mapping[str, Any], out: Path) -> str:
         )
     if "ate_aligned_rmse_m" in row:
         lines.append(f"truth       {row['ate_aligned_rmse_m']:.4f} m RMS, aligned")
+    elif "n_relations" not in row:
+        lines.append(
+            "no error    the log has no true path; give relations, or add a path from a file by "
+            "`estima convert` and solve what it writes (docs/do/solve.md)"
+        )
     return "\n".join([*lines, str(out / "page.html")])

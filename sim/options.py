@@ -39,7 +39,7 @@ from typing import (
 from pydantic import ConfigDict, Field, Strict, ValidationError
 from pydantic.dataclasses import dataclass as checked_dataclass
 
-from sim.errors import InputError, blaming, describe_unknown, require
+from sim.errors import InputError, blaming, describe_unknown, nearest, require
 
 T = TypeVar("T")
 
@@ -207,7 +207,11 @@ def find(target: Any, where: str) -> Callable[..., Any]:
                 "in that of --config-dir, or on PYTHONPATH"
             ) from error
     found: Any = getattr(module, name, None)
-    require(callable(found), f"{where}._target_={target}: {module_name} has no class {name}")
+    if not callable(found):
+        classes = (v for v in vars(module).values() if inspect.isclass(v))
+        own = [v.__name__ for v in classes if v.__module__ == module.__name__]
+        missing = f"{module_name} has no class {name}; {nearest(name, own)}"
+        raise InputError(f"{where}._target_={target}: {missing}")
     try:
         inspect.signature(found)
     except ValueError as error:  # such as dict

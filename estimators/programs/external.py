@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import orjson
 
-from estimators.base import Belief, Estimate, Prior
+from estimators.base import Belief, Estimate, Prior, since_start
 from estimators.programs.program import (
     Program,
     ProgramError,
@@ -76,8 +76,7 @@ class External(ExternalOptions):
     def step(self, frame: Frame) -> Belief:
         """Send the Frame, and take the belief that comes back."""
         message = {"type": "frame", **vars(frame)}
-        answer = self._ask(message, self.step_s, f"the Frame at {frame.stamp:g} s")
-        self._stamps.append(frame.stamp)
+        answer = self._ask(message, self.step_s, self._named(frame))
         self._check_keys(answer)
         mean = self._numbers(answer, "mean", (3,))
         covariance = np.zeros((3, 3))
@@ -85,6 +84,11 @@ class External(ExternalOptions):
             covariance = self._covariances(answer, "covariance", (3, 3))
         status = answer.get("status")
         return Belief(mean, covariance, {} if status is None else {"status": str(status)[:300]})
+
+    def _named(self, frame: Frame) -> str:
+        """The Frame that comes next, by its time, for messages."""
+        self._stamps.append(frame.stamp)
+        return f"the Frame at {since_start(self._stamps, -1)}"
 
     def finish(self) -> Estimate | None:
         """Ask for a revised trajectory, which there may be, and let the program end."""

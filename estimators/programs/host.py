@@ -82,8 +82,8 @@ class Isolated(External):
 
     def step(self, frame: Frame) -> Belief:
         """Send the Frame, and take the belief that comes back."""
-        asked = f"the Frame at {frame.stamp:g} s"
-        answer = self._ask({"type": "frame", **vars(frame)}, self.step_s, asked)
+        message = {"type": "frame", **vars(frame)}
+        answer = self._ask(message, self.step_s, self._named(frame))
         extras = answer.get("extras")
         return Belief(
             answer.get("mean"),  # type: ignore[arg-type]

@@ -14,11 +14,11 @@ from experiments.calibration.sheet import calibrate_sheet
 from experiments.calibration.slip import BLOCK_S
 from experiments.runs.calibration import write_calibration
 from experiments.runs.compose import searched
+from experiments.runs.console import read_log
 from experiments.runs.experiment import Experiment
 from experiments.viewing.style import BLACK, BLUE, save_figure, subplots
 from sim.arrays import Array
 from sim.errors import require
-from sim.formats.detect import read_any
 from sim.recording import load
 
 METHODS = ("wheel-truth", "end-poses")
@@ -64,7 +64,7 @@ def calibrate_log_file(
     """
     require(log, "no log to calibrate; name one")
     require(out.suffix in (".yaml", ".yml"), f"{out}: a calibration is a .yaml file")
-    found = calibrate_log(read_any(log, robot), until_s)
+    found = calibrate_log(read_log(log, robot), until_s)
     intervals = {name: [x.low, x.high] for name, x in found.intervals.items()}
     write_calibration(out, found.calibration, intervals)
     save_figure(residual_figure(found.residuals), out.with_suffix(".png"))

@@ -11,7 +11,7 @@ import typer
 
 from experiments.cli.flags import ConfigDir, Log, WhichRobot, gathered
 from experiments.runs import paths
-from experiments.runs.console import show
+from experiments.runs.console import read_log, say_choice, show
 from sim.errors import require
 
 
@@ -35,6 +35,8 @@ def info(
     from sim.formats.detect import read_all
 
     robots = read_all(log, robot).robots
+    if robot is None:
+        say_choice(log[0], robots[0], by_flag=True)
     require(len(robots) == 1 or not check, "--check takes one robot; choose it with --robot")
     for number, own in enumerate(robots):
         show(describe(own) if len(robots) == 1 else f"robot {number}\n{describe(own)}\n")
@@ -283,10 +285,9 @@ def twin(
     """
     from experiments.twin.make import make_twin
     from experiments.twin.write import check_name, write_twin
-    from sim.formats.detect import read_any
 
     check_name(out)
-    made = make_twin(read_any(log, robot), split_s)
+    made = make_twin(read_log(log, robot), split_s)
     show(made.found.as_text())
     for path in write_twin(made, out):
         show(paths.short(path))

@@ -11,7 +11,7 @@ import typer
 from experiments.cli import completion
 from experiments.cli.flags import ConfigDir, Overrides
 from experiments.runs import columns, paths
-from experiments.runs.console import no_option, show
+from experiments.runs.console import no_option, progress, show
 from sim.errors import nearest, require
 from sim.files import read_text
 
@@ -97,7 +97,9 @@ def _group_of(name: str, config_dir: Path | None) -> str:
     groups = _groups_of(name, config_dir)
     options = [n for g in completion.GROUPS for n in completion.options(g, config_dir)]
     known = [*completion.GROUPS, "metrics", *options]
-    require(groups, f"no group or option {name}; {nearest(name, known)}")
+    listed = nearest(name, known)
+    remedy = "; `estima options` lists all" if listed.endswith(" more") else ""
+    require(groups, f"no group or option {name}; {listed}{remedy}")
     several = " or ".join(f"`estima options {group} {name}`" for group in groups)
     require(len(groups) == 1, f"{name} is an option of several groups: {several}")
     return groups[0]
@@ -119,7 +121,8 @@ def recommend(
     """
     from experiments.report.recommend import SURE, recommend
 
-    advice = recommend(overrides or [])
+    with progress("comparing estimators", 1.0) as on_progress:
+        advice = recommend(overrides or [], on_progress)
     show(
         f"{advice.text}\n\nTo be sure, run the best in your own setting:\n"
         f"  {shlex.join(['estima', 'run', '-m', *advice.sweep])}\n"

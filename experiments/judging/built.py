@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments.judging.claims_file import read_provenance, read_verdicts
-from experiments.judging.folders import STUDIES
+from experiments.judging.folders import STUDIES, SWEEPS
 from experiments.runs.dependencies.digests import changed, digest_of, name_of
 from experiments.runs.dependencies.recorder import Digests, Recorder, digest_of_all
 from experiments.runs.paths import SOURCE
@@ -83,7 +83,7 @@ def list_built(results: Path) -> list[Built]:
 
 def study_of(stem: str) -> str:
     """The study that a file belongs to, by its name."""
-    found = [study for study in STUDIES if stem.startswith(f"{study}_")]
+    found = [study for study in (*STUDIES, *SWEEPS) if stem.startswith(f"{study}_")]
     return found[0] if found else stem.partition("_")[0]
 
 

@@ -18,6 +18,7 @@ OWN = (
     "self_knowledge",
 )  # our own, which judge no claim: run when named
 STUDIES = (*PAPERS, *LOGS, *NAMED, *OWN)
+SWEEPS = ("leaderboard", "all_estimators")  # only their figures are made by `estima reproduce`
 ROOMS = tuple(SOURCE / "experiments" / room for room in ("papers", "studies"))
 
 

@@ -34,17 +34,20 @@ PAPERS = ("puzzlebot2024", "decristoforis2020", "gil2008", "maximo2024")
 OWN = {
     "leaderboard": [
         "estima run -m study=leaderboard",
-        "estima plot leaderboard --x choice.estimator --by choice.world "
-        "-o results/figures/leaderboard_errors.png",
         "estima table leaderboard --against smoother --times --efficiency "
         "-o results/tables/leaderboard_means.csv",
+        "estima reproduce --figures-only --paper leaderboard",
     ],
     "peers": [
         "make setup EXTRAS=peers,tune && make peers",
         reproduce_command("peers"),
         "estima tune peers -o conf/estimator",
     ],
-    "all_estimators": ["estima run -m study=all_estimators"],
+    "all_estimators": [
+        "estima run -m study=all_estimators",
+        "estima table all_estimators -o results/tables/all_estimators_means.csv",
+        "estima reproduce --figures-only --paper all_estimators",
+    ],
     "mcl_office": [reproduce_command("mcl_office")],
     "fastslam_consistency": [reproduce_command("fastslam_consistency")],
     "self_knowledge": [reproduce_command("self_knowledge")],

@@ -25,6 +25,7 @@ _ERROR = "answer_ate_rmse_m"
 _ALWAYS = ("world", "robot.kr", "robot.kl", "route.distance_m")  # compared for every estimator
 _MOST_CHANGES, _MOST_SHOWN, _MOST_TRIED = 6, 8, 4
 _TUNED = "_tuned"
+_COMPOSED = 0.7  # share of the time that goes to the estimators; the rest, to the tables
 SURE = "sure"  # name of the sweep
 
 
@@ -89,13 +90,17 @@ class Advice(NamedTuple):
     sweep: list[str]
 
 
-def recommend(overrides: Sequence[str]) -> Advice:
+def recommend(
+    overrides: Sequence[str], on_progress: Callable[[float], None] = lambda _: None
+) -> Advice:
     """Find which estimators fit, what they did in the nearest judged settings, and what to run.
 
     Parameters
     ----------
     overrides
         Hydra's, of the robot, its sensors, the world and the prior.
+    on_progress
+        Called with the share that is done.
 
     Raises
     ------
@@ -112,8 +117,9 @@ def recommend(overrides: Sequence[str]) -> Advice:
         )
     with open_composer() as composer:
         Experiment(*composer.compose(overrides).resolve()).check()
-        everyone = list(_candidates(composer, overrides))
+        everyone = list(_candidates(composer, overrides, on_progress))
         rows = judged(composer)
+    on_progress(1.0)
     fits = [each for each in everyone if not each.missing]
     nearest = sorted(_by_table(fits, rows), key=lambda found: found.apart)
     lines, shown = [f"Fits: {', '.join(each.name for each in fits)}.", ""], set[str]()
@@ -129,8 +135,12 @@ def recommend(overrides: Sequence[str]) -> Advice:
     return Advice("\n".join(lines), _to_be_sure(overrides, fits, nearest))
 
 
-def _candidates(composer: Composer, overrides: Sequence[str]) -> Iterable[Candidate]:
-    for option in paths.option_names("estimator"):
+def _candidates(
+    composer: Composer, overrides: Sequence[str], on_progress: Callable[[float], None]
+) -> Iterable[Candidate]:
+    options = paths.option_names("estimator")
+    for number, option in enumerate(options):
+        on_progress(_COMPOSED * number / len(options))
         asked = [*overrides, f"estimator={option}"]
         experiment = Experiment(*composer.compose(asked).resolve())
         missing = experiment.missing()

@@ -1,5 +1,7 @@
 """Terminal output: progress, and the one line that ends a failed command."""
 
+from __future__ import annotations
+
 import errno
 import math
 import os
@@ -10,10 +12,14 @@ import time
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
-from typing import Any, NoReturn, TextIO
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NoReturn, TextIO
 
 from experiments.runs.paths import option_names
 from sim.errors import InputError, nearest, printable
+
+if TYPE_CHECKING:
+    from sim.recording import Recording
 
 _QUIET_S = 2.0  # what ends sooner shows no progress
 _LINE_EVERY_S = 10.0  # where the output is a file
@@ -206,6 +212,30 @@ def show(text: str) -> None:
     Those are characters that would control it, and those that its encoding lacks.
     """
     _write("\n".join(map(printable, text.split("\n"))), sys.stdout)
+
+
+def read_log(log: Sequence[Path], robot: int | None = None, *, by_flag: bool = True) -> Recording:
+    """Read a log of one robot, as `read_any` does; of several say which it is.
+
+    Parameters
+    ----------
+    by_flag
+        As for `describe_choice`.
+    """
+    from sim.formats.detect import read_any
+
+    recording = read_any(log, robot)
+    if robot is None:
+        say_choice(log[0], recording, by_flag=by_flag)
+    return recording
+
+
+def say_choice(path: Path, recording: Recording, *, by_flag: bool = False) -> None:
+    """Say which robot of several a recording is that nobody chose."""
+    from sim.formats.detect import describe_choice
+
+    if choice := describe_choice(path, recording, by_flag=by_flag):
+        show(choice)
 
 
 def warn(text: str) -> None:

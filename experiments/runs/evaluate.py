@@ -20,6 +20,7 @@ from estimators.base import (
     explain_unsound,
     run,
     run_and_finish,
+    since_start,
 )
 from estimators.team import run_team
 from experiments.evaluation.map_quality import landmark_errors
@@ -257,7 +258,7 @@ def status_of(recording: Recording, online: Estimate, revised: Estimate | None =
         return Status(Outcome.FAILED, "not_finite", "no pose at any time: it was never placed")
     if online.status == "ok" and not sound.all():
         step = int(np.argmin(sound))
-        detail = f"not finite at {online.stamps[step]:.2f} s, step {step}"
+        detail = f"not finite at {since_start(online.stamps, step)}, step {step}"
         return Status(Outcome.FAILED, "not_finite", detail)
     paths = [path for path in (online, revised) if path is not None]
     for path in paths:

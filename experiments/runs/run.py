@@ -13,7 +13,7 @@ from estimators.base import Estimate
 from estimators.programs.program import ProgramError
 from experiments.runs import paths
 from experiments.runs.columns import COLUMNS, DEPENDENCIES, REVISED
-from experiments.runs.console import RunFailedError, progress, show, warn
+from experiments.runs.console import RunFailedError, progress, say_choice, show, warn
 from experiments.runs.dependencies.recorder import recorded
 from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
@@ -56,6 +56,8 @@ def run_once(experiment: Experiment, draw: Draw, out: Path | None = None) -> lis
     def fetch() -> Team:
         with shown("simulated seconds", expected_duration_s(experiment)) as on_progress:
             read = experiment.recordings(on_progress)
+        if experiment.is_read and experiment.team is None:
+            say_choice(Path(experiment.config["recording"]), read.only)
         slip = experiment.believed_slip
         if (
             len(read) == 1
@@ -107,6 +109,11 @@ def run_once(experiment: Experiment, draw: Draw, out: Path | None = None) -> lis
     if found and experiment.config["picture"]:
         _draw(draw, found, experiment, folder)
     _print(rows, [file for file in written if file is not None and file.exists()])
+    if found and all(recording.truth is None for recording, _ in found):
+        show(
+            "  no error: the recording has no true path; `estima convert` adds one from a file, or "
+            "`estima score` judges by relations (docs/do/solve.md)"
+        )
     for row in rows:
         if row["status"] == Outcome.FAILED:
             raise RunFailedError(f"{row['status_code']}: {row['status_detail']}")

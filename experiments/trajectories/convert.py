@@ -16,7 +16,7 @@ from experiments.trajectories.part import WHOLE, Part
 from experiments.trajectories.read import read_trajectory
 from sim.errors import InputError, require, required
 from sim.files import check_writable
-from sim.formats.detect import kind_of, read_any
+from sim.formats.detect import describe_choice, kind_of, read_any
 from sim.formats.mrclam import read_team
 from sim.formats.tum import write_tum
 from sim.recording import Recording, save
@@ -155,9 +155,11 @@ def convert_log(
         write_estimate(out, estimate)
         seconds = estimate.stamps[-1] - estimate.stamps[0]
         return f"{out}: {len(estimate.stamps)} poses, {seconds:.1f} s"
-    recording = part.of(read_any(log, robot))
+    recording = part.of(read := read_any(log, robot))
     write_recording(out, recording)
     said = f"{out}: {recording.duration_s:.1f} s, {len(recording.frame_stamps)} frames"
+    if robot is None and (choice := describe_choice(log[0], read, by_flag=True)):
+        said = f"{choice}\n{said}"
     dropped = ", ".join(name for name in recording.logs if name != "laser")
     if dropped and out.suffix == ".log":
         said += f"\nleft out, since a CARMEN log holds one laser: {dropped}"

@@ -7,7 +7,7 @@ from experiments.runs import paths
 from sim.arrays import Array
 from sim.errors import printable
 from sim.recording import Log, Recording
-from sim.sensors import Laser, sensors_from_config
+from sim.sensors import Laser, RealLaser, sensors_from_config
 from sim.yaml_file import read_yaml
 
 
@@ -44,20 +44,22 @@ def describe(recording: Recording) -> str:
 
 
 def recognize(recording: Recording, name: str) -> str | None:
-    """The preset of `conf/sensors` that a recorded laser is like: its model, if it is a common one.
+    """The preset of `conf/sensors` that a recorded laser is like.
 
-    It has as many beams, to one, at the same step to 1 percent and at the same rate to 15.
+    It has as many beams, to one, at the same step to 1 percent and at the same rate to 15. A
+    simulated laser is like a preset of its own class; a real one like one that models a device.
     """
     sensor, stamps = recording.sensors[name], recording.log(name).stamps
     if not isinstance(sensor, Laser) or sensor.n_beams < 2 or len(stamps) < 2:
         return None
     rate_hz = 1.0 / float(np.median(np.diff(stamps)))
+    kind = RealLaser if "source" in recording.config else type(sensor)
     for option in paths.option_names("sensors"):
         settings = read_yaml(paths.CONF / "sensors" / f"{option}.yaml").get("laser")
-        if settings is None or "real_laser" not in settings["_target_"]:
+        if settings is None:
             continue
         model = sensors_from_config({"laser": settings})["laser"]
-        if isinstance(model, Laser):
+        if isinstance(model, Laser) and type(model) is kind:
             steps = [np.diff(laser.bearings_rad[:2])[0] for laser in (sensor, model)]
             alike = (
                 abs(steps[0] / steps[1] - 1.0) < 0.01 and abs(rate_hz / model.rate_hz - 1) < 0.15

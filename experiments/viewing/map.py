@@ -9,12 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from experiments.evaluation.time_sync import interpolate
-from experiments.runs.console import progress
+from experiments.runs.console import progress, read_log
 from experiments.viewing.estimates import check_no_overrides, estimate_along
 from experiments.viewing.grid import describe_grid
 from sim.arrays import Array
 from sim.errors import require, required
-from sim.formats.detect import read_any
 from sim.recording import Recording
 from sim.sensors import Laser
 from sim.worlds.grid import OccupancyGrid
@@ -81,7 +80,7 @@ def map_file(log: str, source: str, overrides: Sequence[str], out: Path, how: Gr
     """
     check_name(out)
     require("=" not in log, f"{log}: name a recording first, such as run.npz")
-    recording = read_any([Path(log)])
+    recording = read_log([Path(log)], by_flag=False)
     n_all = len(recording.log(how.laser).stamps)
     with progress(source, len(recording.frame_stamps)) as on_step:
         path = path_of(recording, source, overrides, on_step)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from experiments.runs import paths
-from experiments.runs.console import enumerate_words, progress
+from experiments.runs.console import enumerate_words, progress, say_choice
 from experiments.runs.experiment import Experiment
 from experiments.viewing import live, movie
 from experiments.viewing.estimates import OnStep, with_all_estimates
@@ -124,8 +124,10 @@ def play_file(log: Path, sources: Sequence[str], overrides: Sequence[str], how: 
     sources, overrides
         As for `viewing.estimates.with_all_estimates`.
     """
+    team = read_all([log])
+    say_choice(log, team.robots[0])
     return play(
-        read_all([log]),
+        team,
         how,
         log.name,
         sources,

@@ -10,7 +10,7 @@ from sim.files import read_head
 from sim.formats import carmen, khepera
 from sim.formats.intel import N_THINNED_BEAMS, read_intel, read_thinned_intel
 from sim.formats.lego import read_lego
-from sim.formats.mrclam import read_mrclam
+from sim.formats.mrclam import read_mrclam, robots_in
 from sim.formats.rawseeds import read_rawseeds
 from sim.formats.rosbag_in import read_bag
 from sim.formats.text import read_bytes, read_members
@@ -211,6 +211,28 @@ def read_any(paths: Sequence[Path], robot: int | None = None) -> Recording:
     team = read_all(paths, robot)
     with naming(paths[0]):
         return team.only
+
+
+def describe_choice(path: Path, recording: Recording, *, by_flag: bool) -> str:
+    """Say which robot of a set was read where nobody named one; empty if the log holds only one.
+
+    Parameters
+    ----------
+    by_flag
+        Whether the command has a --robot to name another; else a recording of it does.
+    """
+    if recording.config.get("source") != "mrclam" or _is_recording(path):
+        return ""
+    robots = robots_in(read_members(path))
+    if len(robots) < 2:
+        return ""
+    remedy = "--robot N takes another"
+    if not by_flag:
+        remedy = f"for another, name what `estima convert {path} --robot N -o robotN.npz` writes"
+    return (
+        f"{path.name} holds robots {robots[0]} to {robots[-1]}; robot "
+        f"{recording.config['robot']} is taken: {remedy}"
+    )
 
 
 def _is_archive(data: bytes) -> bool:

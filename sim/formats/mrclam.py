@@ -17,7 +17,7 @@ whose column error gives that of the bearing.
 import dataclasses
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -123,6 +123,12 @@ def read_mrclam(
     )
 
 
+def robots_in(members: Iterable[str]) -> list[int]:
+    """Numbers of the robots of a data set, by the names of its files."""
+    found = (re.fullmatch(r"Robot(\d+)_Odometry\.dat", name) for name in members)
+    return sorted(int(match[1]) for match in found if match)
+
+
 def _table(members: Mapping[str, bytes], path: Path, name: str, n_columns: int) -> Array:
     """Table of a file of the set."""
     robots = sorted(m[5:-13] for m in members if m.endswith("_Odometry.dat"))
@@ -147,8 +153,7 @@ def read_team(path: Path, camera: StereoCamera = CAMERA) -> Team:
         As for `read_mrclam`.
     """
     members = read_members(path)
-    found = (re.fullmatch(r"Robot(\d+)_Odometry\.dat", name) for name in members)
-    robots = sorted(int(match[1]) for match in found if match)
+    robots = robots_in(members)
     sensor = RobotCamera(
         **{f.name: getattr(camera, f.name) for f in dataclasses.fields(RobotCamera)[:-2]},
         marker_z_m=camera.mount.z_m,

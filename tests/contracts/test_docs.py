@@ -4,6 +4,7 @@ import os
 import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -11,10 +12,11 @@ import pytest
 import estima
 from estimators.on_a_map.mcl import Mcl
 from experiments.cli.main import _COMMANDS
-from experiments.judging.folders import code_folder
+from experiments.judging.folders import PAPERS, code_folder, findings
 from experiments.papers.puzzlebot2024 import study as puzzlebot2024
 from experiments.runs.paths import option_names
 from sim.options import described
+from sim.yaml_file import read_yaml
 
 # studies of questions of ours, beyond the parts of the papers
 NOT_OF_A_PART = {
@@ -42,6 +44,24 @@ def test_the_papers_page_names_what_there_is():
     for name in re.findall(r"`study\.(\w+)`", of_puzzlebot):
         assert hasattr(puzzlebot2024, name), name
     assert {name for name in there if name.startswith(papers)} - studies <= NOT_OF_A_PART
+
+
+def test_the_papers_and_the_version_are_cited_alike_everywhere():
+    cited = read_yaml(ROOT / "CITATION.cff")
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert (cited["version"], cited["license"]) == (project["version"], project["license"])
+    assert [one["name"] for one in cited["authors"]] == [one["name"] for one in project["authors"]]
+    readme = (ROOT / "README.md").read_text()
+    references = {one["abstract"]: one for one in cited["references"]}
+    assert set(references) == set(PAPERS)
+    for name, one in references.items():
+        said = findings(name)
+        for place in (readme, said["source"]):
+            assert one["title"] in place
+            assert str(one["year"]) in place
+            assert all(author["family-names"] in place for author in one["authors"])
+        assert str(one.get("doi", "")) == str(said["doi"])
+        assert str(said["doi"]) in readme
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from estimators.base import Belief, Estimate, explain_unsound, run
+from estimators.base import Belief, Estimate, Prior, explain_unsound, run
 from estimators.odometry import Odometry
 from experiments.runs.evaluate import evaluate, status_of
 from experiments.runs.experiment import Experiment
@@ -89,6 +89,31 @@ def test_the_first_is_an_error_of_the_input():
             Errs(WRONG["scalars"][0], 0), recording, fakes.tracking_prior(recording),
             np.random.default_rng(0),
         )  # fmt: skip
+
+
+def test_times_are_seconds_from_the_start_whatever_clock_a_log_has():
+    class Warns(Odometry):
+        def step(self, frame):
+            belief = super().step(frame)
+            return Belief(belief.mean, belief.covariance, {"status": "poor_overlap"})
+
+    drive = fakes.circle()
+    wheels, clock_s = drive.wheels, 976052857.0
+    late = dataclasses.replace(
+        drive,
+        frame_stamps=drive.frame_stamps + clock_s,
+        wheels=dataclasses.replace(wheels, stamps=wheels.stamps + clock_s),
+        sensors={"encoder": drive.sensors["encoder"]},
+        logs={},
+        truth=None,
+    )
+    prior = Prior(late.robot, late.sensors, np.zeros(3), 1e-6 * np.eye(3))
+    online = run(Warns(kr=1e-5, kl=1e-5), late, prior, np.random.default_rng(0))
+    assert online.status == "poor_overlap at 0.00 s"
+    wrong = dataclasses.replace(online, covariances=online.covariances.copy(), status="ok")
+    wrong.covariances[STEP] = np.nan
+    at = f"{drive.frame_stamps[STEP] - drive.frame_stamps[0]:.2f} s, step {STEP}"
+    assert explain_unsound(wrong).endswith(f"at {at}")
 
 
 def test_a_revised_path_is_checked_too():

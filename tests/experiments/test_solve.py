@@ -9,7 +9,7 @@ import pytest
 
 from experiments import solve as solving
 from experiments.runs.calibration import read_calibration
-from experiments.solve import solve
+from experiments.solve import as_text, solve
 from sim import se2
 from sim.formats.relations import Relations, write_relations
 from sim.formats.tum import read_tum
@@ -84,6 +84,15 @@ def test_truth_is_not_looked_at():
     moved = dataclasses.replace(log.truth, poses=log.truth.poses[::-1].copy())
     paths = [solve(one).path for one in (log, dataclasses.replace(log, truth=moved))]
     np.testing.assert_array_equal(paths[0].means, paths[1].means)
+
+
+def test_a_log_without_a_truth_says_that_its_error_is_unknown(solved):
+    row = json.loads((solved[1] / "summary.json").read_text())
+    assert "no error" not in as_text(row, solved[1])
+    unjudged = {k: v for k, v in row.items() if k not in ("n_relations", "ate_aligned_rmse_m")}
+    assert "no error    the log has no true path; give relations, or" in as_text(
+        unjudged, solved[1]
+    )
 
 
 def test_an_interrupt_says_that_nothing_is_kept(tmp_path, monkeypatch):

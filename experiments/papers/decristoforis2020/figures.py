@@ -107,14 +107,18 @@ def ellipses(office: Arrays, areas: pd.DataFrame, path: pd.DataFrame) -> Figure:
 
     The axes are those along a corridor of the judged ones, with bare legs, objects and bends.
     """
-    page = figure(6.2, 6.0)
-    top, bottom = page.subfigures(2, 1, height_ratios=(1.5, 1.0))  # type: ignore[misc]
+    page = figure(9.0, 6.0)
+    top, bottom = page.subfigures(2, 1, height_ratios=(1.3, 1.0))  # type: ignore[misc]
     scale = 0.6 / (2.45 * areas["long_m"].quantile(0.9))
     for ax, name, what in zip(
-        top.subplots(1, 2), "AB", ("a curve", "a corridor with objects"), strict=True
+        top.subplots(1, 2, width_ratios=(1.0, 3.2)),
+        "AB",
+        ("a curve", "a corridor with objects, lying down"),
+        strict=True,
     ):
         rows = areas[areas["area"] == name]
-        _enlarged_ellipses(ax, office, rows, scale, f"{name}: {what}\n(ellipses times {scale:.0f})")
+        _enlarged_ellipses(ax, office, rows, scale, f"{name}: {what}", lying=name == "B")
+    top.suptitle(f"95 % ellipses of a registration, {scale:.0f} times enlarged", size=9)
     ax = bottom.subplots()
     for name, color in (("long", BLUE), ("short", ORANGE)):
         sigma_mm = 1e3 * path[f"{name}_m"]
@@ -140,21 +144,29 @@ def ellipses(office: Arrays, areas: pd.DataFrame, path: pd.DataFrame) -> Figure:
 
 
 def _enlarged_ellipses(
-    ax: Axes, office: Arrays, rows: pd.DataFrame, scale: float, title: str
+    ax: Axes, office: Arrays, rows: pd.DataFrame, scale: float, title: str, *, lying: bool
 ) -> None:
-    """Draw enlarged ellipses of one area, one every 0.75 m along the path."""
-    draw_walls(ax, office["walls"], office["wall_z_m"])
+    """Draw enlarged ellipses of one area, one every 0.75 m along the path; y to the right if lying.
+
+    A corridor that runs along y would be a sliver upright.
+    """
+    order = [1, 0] if lying else [0, 1]
+    x, y = (np.array(["x_m", "y_m"])[order]).tolist()
+    walls = office["walls"].reshape(-1, 2, 2)[:, :, order].reshape(-1, 4)
+    draw_walls(ax, walls, office["wall_z_m"])
     ax.set_title(title, fontsize="medium")
+    ax.set(xlabel=f"{x[0]}, m", ylabel=f"{y[0]}, m")
     if rows.empty:  # a short drive may not get there
         return
-    ax.plot(rows["x_m"], rows["y_m"], color=TRUTH, lw=0.6)
+    ax.plot(rows[x], rows[y], color=TRUTH, lw=0.6)
     along = rows["distance_m"].to_numpy()
     drawn = rows.iloc[np.searchsorted(along, np.arange(along[0], along[-1], 0.75))]
     squares_m2 = drawn[["xx_m2", "xy_m2", "xy_m2", "yy_m2"]].to_numpy().reshape(-1, 2, 2)
-    draw_ellipses(ax, drawn[["x_m", "y_m"]], scale**2 * squares_m2, fill=False, color=BLUE, lw=0.9)
+    squares_m2 = scale**2 * squares_m2[:, order][:, :, order]
+    draw_ellipses(ax, drawn[[x, y]], squares_m2, fill=False, color=BLUE, lw=0.9)
     ax.set(
-        xlim=(rows["x_m"].min() - 1.5, rows["x_m"].max() + 1.5),
-        ylim=(rows["y_m"].min() - 1.5, rows["y_m"].max() + 1.5),
+        xlim=(rows[x].min() - 1.5, rows[x].max() + 1.5),
+        ylim=(rows[y].min() - 1.5, rows[y].max() + 1.5),
     )
 
 
@@ -206,7 +218,7 @@ def _boxes(axes: Sequence[Axes], table: pd.DataFrame) -> None:
         )  # fmt: skip
         for patch, method in zip(drawn["boxes"], rows.index, strict=True):
             patch.set(facecolor=COLORS[method], alpha=0.6)
-        ax.set(yscale="log", ylabel=label, ylim=(stats["q1"].min() / 10, None))
+        ax.set(ylabel=label, ylim=(0.0, None))
 
 
 def real_log(log: Arrays, table: pd.DataFrame) -> Figure:
@@ -229,7 +241,7 @@ def real_log(log: Arrays, table: pd.DataFrame) -> Figure:
 
 def maps(office: Arrays, drawn: pd.DataFrame) -> Figure:
     """Figure 5: laser points placed by each method, over the true walls."""
-    page, axes = subplots(10.0, 3.1, 1, 3, sharex=True, sharey=True)
+    page, axes = subplots(10.0, 3.6, 1, 3, sharex=True, sharey=True)
     for ax, method in zip(axes, PAPERS_OWN, strict=True):
         draw_walls(ax, office["walls"], office["wall_z_m"], color=RED, lw=0.5)
         ax.plot(*office[f"{method}_points"].T, ",", color=TRUTH, alpha=0.8)

@@ -16,7 +16,13 @@ from experiments.judging.results import Arrays, Results
 from experiments.papers.gil2008.claims import HEADLINES, pool_by_world
 from experiments.papers.gil2008.settings import CELL_M
 from experiments.viewing.grid import UNKNOWN, draw_grid
-from experiments.viewing.plotting import draw_band, draw_series, set_axes, with_legend
+from experiments.viewing.plotting import (
+    draw_band,
+    draw_series,
+    name_ends,
+    set_axes,
+    with_legend,
+)
 from experiments.viewing.style import (
     BLACK,
     BLUE,
@@ -261,7 +267,7 @@ def by_particles(repeats: pd.DataFrame, bound: pd.DataFrame) -> Figure:
     set_axes(grid[-1], xlabel="particles M")
     n_runs = len(repeats[drawn]) // repeats.groupby(["filter", "n_particles"]).ngroups
     page.suptitle(
-        f"one drive, {n_runs} runs each, bars of two standard deviations; "
+        f"one drive, {n_runs} runs each; bars: two standard deviations, cut at zero; "
         f"RMS error of odometry: {repeats['odometry_rmse_m'][0]:.1f} m"
     )
     return with_legend(page, ncols=4)
@@ -321,7 +327,9 @@ def by_distance(distance: pd.DataFrame) -> Figure:
         ax.axvline(10.0, color=BLACK, lw=0.6, ls=":")
         words = "farthest distance of an observation (dmax), m"
         set_axes(ax, xlabel=words, ylabel=label, plain="y")
-    return with_legend(page, ncols=1, loc="outside right center")
+    drawn = {str(one.get_label()): one for one in ax.get_lines() if one.get_marker() == "o"}
+    name_ends(page, ax, drawn)
+    return page
 
 
 def by_observations(observations: pd.DataFrame) -> Figure:

@@ -6,6 +6,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from experiments.judging.results import Arrays, Results
 from experiments.papers.puzzlebot2024.settings import (
@@ -15,8 +16,23 @@ from experiments.papers.puzzlebot2024.settings import (
     REPORTED_TURN_RATIO,
     TABLE_1_K_M,
 )
-from experiments.viewing.plotting import draw_table, plain_ticks, set_axes, with_legend
-from experiments.viewing.style import BLACK, BLUE, CYCLE, ORANGE, draw_ellipses, plan_axes, subplots
+from experiments.viewing.plotting import (
+    draw_table,
+    name_ends,
+    plain_ticks,
+    set_axes,
+    with_legend,
+)
+from experiments.viewing.style import (
+    BLACK,
+    BLUE,
+    CYCLE,
+    ORANGE,
+    WALL,
+    draw_ellipses,
+    plan_axes,
+    subplots,
+)
 
 _METHODS = {
     "wheel_truth": "wheel truth",
@@ -28,6 +44,7 @@ _ROBOTS = {
     "puzzlebot_short_turns": "turns 0.44 of the command",
 }
 _FEEDBACKS = {"truth": "steered by the true pose", "odometry": "steered by odometry"}
+_COVERED = 0.93, 0.97  # shares of 95 % ellipses that count as right
 _PARAMETERS = {"kr": "$k_r$", "kl": "$k_l$"}
 
 
@@ -177,23 +194,42 @@ def _estimates(ax: Axes, part: pd.DataFrame, level: int, color: str) -> None:
 
 
 def table_1(table: pd.DataFrame) -> Figure:
-    """Print table 1 of the report, with our robots' ends and kr, kl from each case alone."""
-    header = (*_OF_THE_CASE, "real x, m", "real θ, rad", "$k_r$, 1e-4 m", "$k_l$, 1e-4 m")
-    cells = [
-        (
-            *_case(row),
-            f"{row.real_x_mean_m:z.3f} ± {row.real_x_sd_m:.3f}",
-            f"{row.real_heading_mean_rad:z.3f} ± {row.real_heading_sd_rad:.3f}",
-            f"{1e4 * row.kr_m:.2f} [{1e4 * row.kr_low_m:.2f}, {1e4 * row.kr_high_m:.2f}]",
-            f"{1e4 * row.kl_m:.2f} [{1e4 * row.kl_low_m:.2f}, {1e4 * row.kl_high_m:.2f}]",
-        )
-        for row in table.itertuples()
-    ]
-    title = (
-        f"table 1, {CALIBRATION_RUNS} runs a case; true $k_r$ = {1.5e4 * TABLE_1_K_M:g}e-4 m, "
-        f"$k_l$ = {0.5e4 * TABLE_1_K_M:g}e-4 m"
+    """Draw the ends of table 1 of the report by our robots, and kr and kl from each case alone."""
+    table = table.iloc[::-1].reset_index(drop=True)
+    page, (straight, turned, slip) = subplots(9.0, 3.6, 1, 3, sharey=True)
+    for ax, real, ideal, unit in (
+        (straight, "real_x", "ideal_x_m", "m"),
+        (turned, "real_heading", "ideal_heading_rad", "rad"),
+    ):
+        mean, sd = (table[f"{real}_{name}_{unit}"] for name in ("mean", "sd"))
+        off = 1e3 * (mean - table[ideal])
+        ax.errorbar(off, table.index, xerr=1e3 * sd, fmt="o", color=BLUE, ms=4)
+        ax.axvline(0.0, color=BLACK, lw=0.8)
+    for k, (name, color, share) in enumerate((("kr", BLUE, 1.5), ("kl", ORANGE, 0.5))):
+        value, *ends = (1e4 * table[f"{name}{end}_m"] for end in ("", "_low", "_high"))
+        at = table.index + 0.16 - 0.32 * k
+        slip.plot(ends, [at, at], color=color, lw=1.4)
+        slip.plot(value, at, "o", color=color, ms=4, label=_PARAMETERS[name])
+        slip.axvline(1e4 * share * TABLE_1_K_M, color=color, lw=0.9, ls=":")
+    straight.set(
+        title="end x",
+        xlabel="real less ideal, mm",
+        yticks=table.index,
+        yticklabels=map(_run, table.itertuples()),
     )
-    return draw_table(header, cells, title, (9.0, 3.4))
+    turned.set(title="end heading", xlabel="real less ideal, mrad")
+    slip.set(title="slip by this case alone", xlabel="1e-4 m (dotted: true)", xlim=(0.0, None))
+    slip.legend(loc="center", bbox_to_anchor=(0.6, 0.5), fontsize=8)
+    page.suptitle(
+        f"{CALIBRATION_RUNS} runs a case: mean and standard deviation; 95 % intervals", size=9
+    )
+    return page
+
+
+def _run(row: Any) -> str:
+    """A case with its command."""
+    speed = f"{row.omega_radps:g} rad/s" if row.omega_radps else f"{row.v_mps:g} m/s"
+    return f"{row.case.replace('_', ' ')}: {speed}, {row.duration_s:g} s"
 
 
 def table_1_short_turns(table: pd.DataFrame) -> Figure:
@@ -318,32 +354,35 @@ def convergence(table: pd.DataFrame) -> Figure:
 
 def coverage(table: pd.DataFrame) -> Figure:
     """Draw the share of true ends in the ideal robot's ellipse and ellipsoid against k."""
-    page, axes = subplots(9.0, 4.0, 1, 2, sharey=True)
+    page, axes = subplots(10.0, 4.0, 1, 2, sharey=True)
     for ax, column, title in zip(
         axes,
         ("in_ellipse", "in_ellipsoid"),
         ("position in the 95 % ellipse", "pose in the 95 % ellipsoid"),
         strict=True,
     ):
-        ax.axhspan(0.93, 0.97, color=BLACK, alpha=0.1, lw=0, label="0.93 to 0.97")
-        for i, (name, part) in enumerate(table.groupby("case", sort=False)):
+        ax.axhspan(*_COVERED, color=BLACK, alpha=0.1, lw=0)
+        lines: dict[str, Line2D] = {}
+        colours = iter(CYCLE)
+        for name, part in table.groupby("case", sort=False):
             share = part[column] / part["runs"]
-            linear = str(name).startswith("linear")
-            ax.errorbar(
+            stays = bool((share > _COVERED[0]).all())
+            drawn = ax.errorbar(
                 part["k_m"],
                 share,
                 1.96 * np.sqrt(share * (1 - share) / part["runs"]),
-                fmt="-o" if linear else "--s",
+                fmt="-o",
                 ms=3,
                 lw=1.0,
-                color=CYCLE[i % 4 if linear else (i - 4) % 5],
-                label=str(name).replace("_", " "),
+                color=WALL if stays else next(colours),
             )
+            lines["all others" if stays else str(name).replace("_", " ")] = drawn.lines[0]
         ax.set(
             xlabel="k, m ($k_r$ = 1.5 k, $k_l$ = 0.5 k)",
             xscale="log",
             xlim=(table["k_m"].min() * 0.7, table["k_m"].max() * 1.4),
             title=title,
         )
-    axes[0].set_ylabel("share of runs")
-    return with_legend(page, ncols=1, loc="outside right center")
+        name_ends(page, ax, lines)
+    axes[0].set_ylabel("share of runs (grey: 0.93 to 0.97)")
+    return page

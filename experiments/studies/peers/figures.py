@@ -12,6 +12,7 @@ from experiments.viewing.plotting import set_axes
 from experiments.viewing.style import BLUE, ORANGE, WALL, subplots
 
 _BOARDS = [(s, a) for s in (LASER, MAP, STEREO) for a in ("online", "revised")]
+_ENDS = ("ate_low_m", "ate_high_m")
 _PLACES = {"all classes": "", **{name: f"_{name}" for name in CLASSES}}
 
 
@@ -58,9 +59,6 @@ def errors(methods: pd.DataFrame) -> Figure:
         axes.set_xlabel("position RMSE, m", fontsize=8)
     page.legend(handles=_legend(), loc="outside lower center", ncols=4, fontsize=8)
     return page
-
-
-_ENDS = ("ate_low_m", "ate_high_m")
 
 
 def _label(row: "pd.Series[str]") -> str:

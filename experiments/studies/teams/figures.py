@@ -53,14 +53,13 @@ def by_size(errors: pd.DataFrame) -> Figure:
         wide = part.pivot_table(index=["size", "seed"], columns="sightings", values="ate_rmse_m")
         medians = wide.groupby("size").median()
         style = {"marker": marker, "color": colour, "ms": 4.5, "lw": 1.4}
-        for seen, line, words in (
-            (False, "--", "without sightings"),
-            (True, "-", "with sightings"),
-        ):
-            left.plot(medians.index, medians[seen], line, label=f"{NAMES[name]}, {words}", **style)
+        left.plot(medians.index, medians[True], "-", label=NAMES[name], **style)
+        left.plot(medians.index, medians[False], "--", **style)
         for size, worlds in wide.groupby("size"):
             ratio = log_ratio_interval(worlds[True], worlds[False])
             draw_interval(right, size + 0.06 * (k - 1), ratio, marker=marker, color=colour, ms=6)
+    for line, words in (("-", "with sightings"), ("--", "without sightings")):
+        left.plot([], [], line, color=WALL, label=words)
     right.axhline(1.0, color=WALL, lw=0.8)
     sizes = sorted(errors["size"].unique())
     set_axes([left, right], xlabel="robots in the team", xticks=sizes, plain="y")

@@ -62,6 +62,10 @@ def refused(done, *words):
     assert "Traceback" not in done.stderr
 
 
+def test_an_unknown_group_says_what_lists_all():
+    refused(called("options", "nosuch"), "no group or option nosuch", "`estima options` lists all")
+
+
 def test_help_names_every_benchmark():
     text = estima("bench", "--help").stdout
     assert all(name in text for name in SUITES)

@@ -48,7 +48,10 @@ def test_what_fits_is_named_with_where_it_was_measured(which):
 def test_a_wheel_has_no_tables_and_says_so(tmp_path, monkeypatch):
     monkeypatch.setattr(paths, "SOURCE", tmp_path)
     monkeypatch.setattr(paths, "option_names", lambda group: ["odometry", "mcl"])
-    text, sweep = recommend([])
+    shares: list[float] = []
+    text, sweep = recommend([], shares.append)
+    assert shares == sorted(shares)
+    assert shares[-1] == 1.0
     assert "No tables of results are here" in text
     assert "Fits: odometry." in text
     assert "Needs a sensor laser and a map (prior.map=world): mcl." in text

@@ -401,6 +401,14 @@ def test_pictures_that_are_there_are_linked(tmp_path):
     assert links == [f"my%20page/pictures/{best['run_key'][:10]}.html"]
 
 
+def test_a_mean_and_its_interval_may_stand_below_each_other(path):
+    """Else seven columns are wider than a screen of 1400 px."""
+    text = path.read_text()
+    cells = re.findall(r'<td class="number">[^<]+ <span class="whole">\[[^<]+\]</span></td>', text)
+    assert cells
+    assert ".rows td.number { white-space: nowrap" not in text
+
+
 def test_a_wide_table_scrolls_in_its_own_box(tab):
     tab.js("document.querySelector('.sortable').style.width = '3000px'")
     box = "document.querySelector('.scroll')"

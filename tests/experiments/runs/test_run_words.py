@@ -1,6 +1,7 @@
 """What a run and a sweep say in plain words."""
 
 import contextlib
+import dataclasses
 import io
 import multiprocessing
 import re
@@ -14,10 +15,11 @@ from typer.testing import CliRunner
 from experiments.cli.main import app
 from experiments.runs import console
 from experiments.runs.experiment import Experiment
-from experiments.runs.run import _print, expected_duration_s, summarize
+from experiments.runs.run import _print, expected_duration_s, run_once, summarize
 from experiments.viewing.run_figure import run_figure
 from sim import compiled
 from sim.formats.tum import write_tum
+from sim.recording import save
 from tests.experiments.cli.test_cli import QUICK, estima
 
 
@@ -126,6 +128,20 @@ def test_a_run_that_failed_says_why_and_no_metrics(capsys):
     _print([{**of, **bad, **a_row()}, {**of, "status": "ok", **a_row()}], [])
     said = capsys.readouterr().out
     assert "seed 3: 1 of 2 repeats failed, not finite at 1.00 s\n  position RMSE 0.3 m," in said
+
+
+def test_a_run_without_a_truth_says_why_there_is_no_error(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("ESTIMA_RESULTS", str(tmp_path))
+    drive = Experiment.compose(["route=linear_1", *QUICK]).simulate()
+    save(dataclasses.replace(drive, truth=None), tmp_path / "blind.npz")
+    save(drive, tmp_path / "seen.npz")
+    for name, is_said in (("blind", True), ("seen", False)):
+        own = [f"recording={tmp_path / name}.npz", "estimator=odometry", "name=blind"]
+        run_once(Experiment.compose([*QUICK, *own, "picture=false"]), lambda *_: None)
+        said = capsys.readouterr().out
+        assert (
+            "no error: the recording has no true path; `estima convert` adds one" in said
+        ) is is_said
 
 
 def test_the_next_command_has_each_key_once(tmp_path):

@@ -10,7 +10,7 @@ from experiments.viewing.describe import describe, recognize
 from sim.sensors import Laser
 
 QUICK = ["world=rooms", "robot=robocom", "simulation.physics=kinematic", "route.distance_m=1.5"]
-MODELS = ["lms291_quarter", "lms291_degree", "utm30lx", "urg04lx", "rplidar_a1"]
+MODELS = ["hokuyo", "lms291_quarter", "lms291_degree", "utm30lx", "urg04lx", "rplidar_a1"]
 
 
 @pytest.mark.parametrize("model", MODELS)
@@ -18,6 +18,12 @@ def test_a_laser_is_recognized_by_beams_step_and_rate(model):
     recording = Experiment.compose([*QUICK, f"sensors={model}"]).simulate()
     assert recognize(recording, "laser") == model
     assert f"like sensors={model}" in describe(recording)
+
+
+def test_a_real_laser_is_like_a_device_and_not_like_an_ideal_one():
+    recording = Experiment.compose([*QUICK, "sensors=hokuyo"]).simulate()
+    real = dataclasses.replace(recording, config={**recording.config, "source": "carmen"})
+    assert recognize(real, "laser") == "urg04lx"
 
 
 def test_a_laser_of_another_step_or_rate_is_not():

@@ -9,6 +9,9 @@ import pytest
 from experiments.papers.decristoforis2020 import figures as decristoforis2020
 from experiments.papers.gil2008 import figures as gil2008
 from experiments.papers.maximo2024 import figures as maximo2024
+from experiments.papers.puzzlebot2024 import figures as puzzlebot2024
+from experiments.studies.all_estimators import figures as all_estimators
+from experiments.studies.leaderboard import figures as leaderboard
 from experiments.studies.teams import figures as teams
 
 ERRORS = (
@@ -141,3 +144,53 @@ def test_robots_that_drive_the_same_way_all_show():
     named = [text.get_text() for text in page.legends[0].get_texts()]
     assert "start" in named
     assert any("sighting" in name for name in named)
+
+
+def test_sweeps_are_drawn_from_their_means_with_the_best_on_top():
+    slips = [1e-6, 1e-5, 1e-4]
+    rows = [
+        (
+            name,
+            "revised" if name == "b" else "online",
+            kr,
+            error * (1 + kr),
+            error,
+            2 * error,
+            world,
+        )
+        for name, error in (("a", 0.1), ("b", 0.01), ("c", 1.0))
+        for kr, world in zip(slips, ("office", "room", "rooms"), strict=True)
+    ]
+    error = "answer_ate_rmse_m"
+    means = pd.DataFrame(
+        rows,
+        columns=[
+            *("choice.estimator", "answer", "robot.kr", error, f"{error}_low", f"{error}_high"),
+            "choice.world",
+        ],
+    ).assign(**{"sensors.stereo.max_distance_m": np.nan})
+    for page in (all_estimators.slip(means), leaderboard.errors(means)):
+        names = [tick.get_text() for tick in page.axes[0].get_yticklabels()]
+        assert names == ["c", "a", "b (revised)"]
+        assert len(page.legends[0].get_texts()) == 3
+
+
+def test_whiskers_stay_inside_their_axes():
+    ends = {"whislo": 1e-5, "q1": 0.1, "med": 0.2, "q3": 0.4, "whishi": 0.9}
+    kinds = itertools.product(("odometry", "icp", "fusion"), ("position_m", "heading_rad"))
+    table = pd.DataFrame([{"method": m, "error": e, **ends} for m, e in kinds])
+    for ax, unit in zip(decristoforis2020.boxes(table).axes, (1.0, np.degrees(1.0)), strict=True):
+        low, high = ax.get_ylim()
+        assert low <= ends["whislo"]
+        assert high >= unit * ends["whishi"]
+
+
+def test_manoeuvres_that_stay_covered_are_one_grey_family():
+    rows = [
+        (case, k, 1000, share, share)
+        for case, end in (("linear_2", 600), ("linear_3", 950), ("angular_1", 945))
+        for k, share in ((1e-6, 950), (1e-3, end))
+    ]
+    table = pd.DataFrame(rows, columns=["case", "k_m", "runs", "in_ellipse", "in_ellipsoid"])
+    for ax in puzzlebot2024.coverage(table).axes:
+        assert {text.get_text() for text in ax.texts} == {"linear 2", "all others"}

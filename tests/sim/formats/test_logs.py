@@ -8,8 +8,9 @@ import tarfile
 import numpy as np
 import pytest
 
+from experiments.trajectories.convert import convert_log
 from sim.errors import InputError
-from sim.formats import intel, lego, mrclam, rawseeds, relations, wean
+from sim.formats import detect, intel, lego, mrclam, rawseeds, relations, wean
 from sim.formats.detect import read_any
 from sim.formats.text import split_words
 from sim.recording import save
@@ -103,6 +104,26 @@ def test_mrclam(tmp_path):
     assert images
     assert all("ids" not in image for image in images)
     np.testing.assert_array_equal(true_ids(hidden), [0, 1])
+
+
+def test_which_robot_of_several_is_read_is_said(tmp_path):
+    folder = mrclam_folder(tmp_path)
+    assert detect.describe_choice(folder, detect.read_any([folder]), by_flag=True) == ""
+    second = {k.replace("1", "2", 1): v for k, v in samples.mrclam_members().items() if "1" in k}
+    folder = mrclam_folder(tmp_path, **second)
+    recording = detect.read_any([folder])
+    said = "set holds robots 1 to 2; robot 1 is taken: "
+    choice = detect.describe_choice(folder, recording, by_flag=True)
+    assert choice == f"{said}--robot N takes another"
+    choice = detect.describe_choice(folder, recording, by_flag=False)
+    assert choice == f"{said}for another, name what `estima convert {folder} --robot N -o " + (
+        "robotN.npz` writes"
+    )
+    save(recording, tmp_path / "robot1.npz")
+    assert detect.describe_choice(tmp_path / "robot1.npz", recording, by_flag=False) == ""
+    out = tmp_path / "out.npz"
+    assert convert_log([folder], out).startswith(said)
+    assert convert_log([folder], out, 2).startswith(str(out))
 
 
 def test_mrclam_refused(tmp_path):

@@ -112,7 +112,7 @@ LASER, STEREO = "sim.sensors.laser.Laser", "sim.sensors.stereo.StereoCamera"
         ),
         ({"lasr": {}}, r"sensors\.lasr must be a mapping with _target_, such as"),
         ({"laser": 3}, r"sensors\.laser must be a mapping with _target_"),
-        ({"laser": {"_target_": "sim.sensors.laser.Lasr"}}, "has no class Lasr"),
+        ({"laser": {"_target_": "sim.sensors.laser.Lasr"}}, "no class Lasr; did you mean Laser?"),
         ({"laser": {"_target_": "sim.lasers.Laser"}}, r"no module sim\.lasers in the"),
         ({"laser": {"_target_": "Laser"}}, "must name a class"),
         ({"laser": {"_target_": 3}}, "must name a class"),

@@ -1,0 +1,1 @@
+"""Settings of every estimator: a sweep, whose figures are drawn from its table of means."""
