@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import textwrap
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -47,7 +48,7 @@ from experiments.judging.logs import (
     wean_hall,
     why_missing,
 )
-from experiments.runs.calibration import Calibration
+from experiments.runs.calibration import Calibration, read_calibration
 from experiments.runs.evaluate import run_over, status_of
 from experiments.runs.experiment import Experiment
 from experiments.runs.processes import is_interrupt
@@ -59,6 +60,8 @@ from experiments.studies.peers.settings import (
     MAP,
     MRCLAM_ROBOTS,
     STEREO,
+    TOO_DEAR,
+    TUNED,
     WEAN_SIGMAS,
     WEAN_STARTS,
     WHEELS,
@@ -139,10 +142,12 @@ class Case:
 # --- the logs ------------------------------------------------------------------------------------
 
 
-def _by_scans(name: str, logged: Recording, relations: Relations) -> Case:
-    """A log with relations, calibrated by its own scans."""
+def _by_scans(
+    name: str, logged: Recording, relations: Relations, found: Calibration | None = None
+) -> Case:
+    """A log with relations, calibrated by its own scans if that is not given."""
     blind = dataclasses.replace(logged, truth=None)
-    found = calibrate_log(blind).calibration
+    found = found or calibrate_log(blind).calibration
     calibrated = found.apply_to(blind)
     start = known_start(calibrated, np.zeros(3))
     moved = moved_base(logged, calibrated)
@@ -227,7 +232,8 @@ def _bare(path: Path) -> Path:
 def own_case(log: Path) -> Case:
     """A user's log: of scans, or of landmarks with ids and a truth.
 
-    `NAME.relations` beside it (or packed) has its relations, `NAME.tum` its reference poses.
+    `NAME.relations` beside it (or packed) has its relations, `NAME.tum` its reference poses, and
+    `NAME.yaml` its calibration, where it cannot be calibrated by its own scans or landmarks.
 
     Raises
     ------
@@ -237,7 +243,7 @@ def own_case(log: Path) -> Case:
     stem = _bare(log).stem.removesuffix(".tar")
     beside = {
         suffix: path
-        for suffix in (".relations", ".tum")
+        for suffix in (".relations", ".tum", ".yaml")
         for path in (log.with_name(stem + suffix + packed) for packed in ("", *_PACKED))
         if path.is_file()
     }
@@ -254,15 +260,27 @@ def own_case(log: Path) -> Case:
             logged.truth is not None or ".relations" in beside,
             f"nothing judges it; put {stem}.relations or {stem}.tum beside it",
         )
+        by_scans = "laser" in lasers
+        try:
+            found = (
+                read_calibration(beside[".yaml"])
+                if ".yaml" in beside
+                else calibrate_log(
+                    dataclasses.replace(logged, truth=None) if by_scans else logged
+                ).calibration
+            )
+        except InputError as error:
+            raise InputError(
+                f"cannot be calibrated ({error}); put a calibration of its robot beside it, "
+                f"{stem}.yaml of `estima calibrate`"
+            ) from error
         if ".relations" in beside:
-            return _by_scans(stem, logged, read_relations(beside[".relations"]))
-        return _by_poses(stem, logged)
+            return _by_scans(stem, logged, read_relations(beside[".relations"]), found)
+        return _by_poses(stem, logged, found)
 
 
-def _by_poses(name: str, logged: Recording) -> Case:
-    """A log with reference poses, or of landmarks with a truth, from the true start."""
-    blind = logged if "laser" not in logged.sensors else dataclasses.replace(logged, truth=None)
-    found = calibrate_log(blind).calibration
+def _by_poses(name: str, logged: Recording, found: Calibration) -> Case:
+    """A log with reference poses, from the true start."""
     calibrated = found.apply_to(logged)
     moved = moved_base(logged, calibrated)
     first = calibrated.truth_at(calibrated.frame_stamps[:1])[0]
@@ -373,7 +391,9 @@ def methods_of(case: Case) -> Iterator[Experiment]:
     slip = case.calibration.slip
     believed = [f"robot.kr={slip.kr}", f"robot.kl={slip.kl}"]
     for one in plan_experiments(["study=peers", "study/board=rooms", "seed=1000", *believed]):
-        if one.label("arm") in COMPETING and sensor_of(one.estimator_name) in case.boards:
+        name = one.estimator_name
+        takes_part = one.label("arm") in COMPETING and name.removesuffix(TUNED) not in TOO_DEAR
+        if takes_part and sensor_of(name) in case.boards:
             yield one
 
 
@@ -461,7 +481,7 @@ def run_method(case: Case, one: Experiment) -> list[tuple[Row, Errors | None]]:
         if is_interrupt(error):
             raise
         status, online, revised = Status.of_error(error), None, None
-    row |= {"status": str(status.outcome), "reason": status.detail}
+    row |= {"status": str(status.outcome), "reason": textwrap.shorten(status.detail, 120)}
     if status.outcome is Outcome.FAILED or online is None:
         return [(row, None)]
     unused = unused_share(online)
