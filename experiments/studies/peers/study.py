@@ -13,6 +13,8 @@ from experiments.runs.console import warn
 from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Outcome, Row
+from experiments.studies.peers.edges import over_edges
+from experiments.studies.peers.logs import _ordered as ordered
 from experiments.studies.peers.logs import judged_logs
 from experiments.studies.peers.logs import over_folder as over_folder
 from experiments.studies.peers.settings import CLASSES, COMPETING, TUNED
@@ -54,7 +56,9 @@ def run(profile: Profile, out: Results, on_progress: Progress) -> None:
 
 def over_logs(_profile: Profile, on_progress: Progress) -> dict[str, pd.DataFrame]:
     """The table of all methods over the logs of others."""
-    return judged_logs(on_progress)
+    edges = tables_of(over_edges, [()], lambda done: on_progress(0.2 * done))
+    wheels = judged_logs(lambda done: on_progress(0.2 + 0.8 * done))
+    return ordered({"logs": pd.concat([edges["logs"], wheels["logs"]])})
 
 
 PARTS = {"logs": over_logs}
