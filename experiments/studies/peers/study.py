@@ -1,5 +1,7 @@
 """Methods of other projects beside ours, on the same drives through six classes of world."""
 
+from pathlib import Path
+
 import numpy as np
 import pandas as pd
 
@@ -15,14 +17,16 @@ from experiments.runs.experiment import Experiment
 from experiments.runs.row import Outcome, Row
 from experiments.studies.peers.edges import over_edges
 from experiments.studies.peers.logs import _ordered as ordered
-from experiments.studies.peers.logs import judged_logs
-from experiments.studies.peers.logs import over_folder as over_folder
+from experiments.studies.peers.logs import judged_logs, own_logs
+from experiments.studies.peers.logs import over_folder as over_logs_in
 from experiments.studies.peers.settings import CLASSES, COMPETING, TUNED
 from experiments.studies.peers.version import missing, sensor_of, version_of
 from experiments.sweeps.averages import MIN_UNITS, averages
 from experiments.sweeps.plan import plan_experiments
 from experiments.sweeps.tune import FAILED_M
 from experiments.sweeps.winner import differing_pairs
+from sim.errors import InputError
+from sim.formats.detect import kind_of
 
 _ERROR = "ate_rmse_m"
 _SCORES = (_ERROR, "heading_rmse_rad", "nees_mean", "unused_share")
@@ -59,6 +63,22 @@ def over_logs(_profile: Profile, on_progress: Progress) -> dict[str, pd.DataFram
     edges = tables_of(over_edges, [()], lambda done: on_progress(0.2 * done))
     wheels = judged_logs(lambda done: on_progress(0.2 + 0.8 * done))
     return ordered({"logs": pd.concat([edges["logs"], wheels["logs"]])})
+
+
+def over_folder(folder: Path, on_progress: Progress) -> dict[str, pd.DataFrame]:
+    """The same table of a user's folder of logs.
+
+    Raises
+    ------
+    InputError
+        If something in it is no log, before any method runs; or cannot be read.
+    """
+    for log in own_logs(folder):
+        try:
+            kind_of(log)
+        except InputError as error:
+            raise InputError(f"{error}; move it out of the folder of --logs") from error
+    return over_logs_in(folder, on_progress)
 
 
 PARTS = {"logs": over_logs}

@@ -14,7 +14,7 @@ from experiments.evaluation.relations import relation_scores
 from experiments.judging.logs import freiburg, relations_of, why_missing
 from experiments.judging.results import Results
 from experiments.runs.calibration import Calibration, Slip, Wheels, write_calibration
-from experiments.studies.peers import figures, logs
+from experiments.studies.peers import figures, logs, study
 from experiments.studies.peers.settings import CAP_M, LASER, WEAN_STARTS
 from experiments.studies.peers.version import missing
 from sim import se2
@@ -151,8 +151,8 @@ def test_a_bad_folder_or_log_is_one_line_with_its_remedy(tmp_path, folder):
     with pytest.raises(InputError, match="holds no logs; put logs there"):
         logs.own_logs(empty)
     (folder / "shopping.csv").write_text("milk\n")
-    with pytest.raises(InputError, match=r"shopping.csv: not a log of a known format"):
-        logs.own_case(folder / "shopping.csv")
+    with pytest.raises(InputError, match=r"shopping.csv: not a log .* move it out of the folder"):
+        study.over_folder(folder, lambda _: None)
     (folder / "room.yaml").unlink()
     with pytest.raises(InputError, match=r"room.npz: cannot be calibrated .*room.yaml of `estima"):
         logs.own_case(folder / "room.npz")
