@@ -1,18 +1,32 @@
-"""The Intel log in which a graph's edges stand for the wheels, whose relations all have stamps.
+"""Logs in which a graph's edges between scans stand for the wheels.
 
-The log with the robot's own wheels has no clock but at some scans, so few relations judge it.
+Such edges come from a scan matcher that knew the robot: to calibrate them as wheels makes all
+methods worse. So only their noise is that of `estima calibrate`. The Intel log with the robot's own
+wheels stands beside: it has a clock at some scans only, so few relations judge it.
 """
 
+import dataclasses
+
+from experiments.calibration.from_log import calibrate_log
 from experiments.judging.jobs import Tables
 from experiments.judging.logs import GRAPHS, relations_of
-from experiments.studies.peers.logs import _by_scans, methods_of, rows_of
+from experiments.runs.calibration import Wheels
+from experiments.studies.peers.logs import Case, _by_scans, methods_of, rows_of
 from sim.formats import carmen
 
-NAME = "intel, edges"
+LOGS = {"intel, edges": "intel", "fr079": "fr079"}  # their names in GRAPHS
 
 
-def over_edges() -> Tables:
-    """Rows of all methods on that log."""
-    logged = carmen.to_recording(carmen.read_carmen(GRAPHS["intel"]))
-    case = _by_scans(NAME, logged, relations_of("intel"))
+def case_of(name: str) -> Case:
+    """One of `LOGS`: wheels and mount as logged, noise as calibrated."""
+    logged = carmen.to_recording(carmen.read_carmen(GRAPHS[LOGS[name]]))
+    blind = dataclasses.replace(logged, truth=None)
+    as_logged = Wheels(gain_right=1.0, gain_left=1.0, track_m=logged.robot.track_m, delay_s=0.0)
+    noise = dataclasses.replace(calibrate_log(blind).calibration, wheels=as_logged, sensors={})
+    return _by_scans(name, logged, relations_of(LOGS[name]), noise)
+
+
+def over_edges(name: str) -> Tables:
+    """Rows of all methods on one of `LOGS`."""
+    case = case_of(name)
     return {"logs": rows_of(case, methods_of(case))}
