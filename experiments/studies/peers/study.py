@@ -7,6 +7,7 @@ import pandas as pd
 
 from experiments.evaluation.statistics import log_ratio_interval
 from experiments.judging.jobs import Progress, Tables, group_by, tables_of
+from experiments.judging.logs import why_missing
 from experiments.judging.remake import Cells, Remake
 from experiments.judging.results import Profile, Results
 from experiments.runs.columns import REVISED
@@ -15,9 +16,9 @@ from experiments.runs.console import warn
 from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Outcome, Row
-from experiments.studies.peers.edges import over_edges
+from experiments.studies.peers import edges
+from experiments.studies.peers.logs import LOGS, over_log, own_logs
 from experiments.studies.peers.logs import _ordered as ordered
-from experiments.studies.peers.logs import judged_logs, own_logs
 from experiments.studies.peers.logs import over_folder as over_logs_in
 from experiments.studies.peers.settings import CLASSES, COMPETING, TUNED
 from experiments.studies.peers.version import missing, sensor_of, version_of
@@ -60,9 +61,16 @@ def run(profile: Profile, out: Results, on_progress: Progress) -> None:
 
 def over_logs(_profile: Profile, on_progress: Progress) -> dict[str, pd.DataFrame]:
     """The table of all methods over the logs of others."""
-    edges = tables_of(over_edges, [()], lambda done: on_progress(0.2 * done))
-    wheels = judged_logs(lambda done: on_progress(0.2 + 0.8 * done))
-    return ordered({"logs": pd.concat([edges["logs"], wheels["logs"]])})
+    if why := why_missing():
+        raise InputError(f"{why}; put them there, or name a folder of logs with --logs")
+    by_edges = [(name,) for name in edges.LOGS]
+    by_wheels = [(name,) for name in LOGS if name not in edges.LOGS]
+    share = len(by_edges) / len(by_edges + by_wheels)
+    parts = [
+        tables_of(edges.over_edges, by_edges, lambda done: on_progress(share * done)),
+        tables_of(over_log, by_wheels, lambda done: on_progress(share + (1.0 - share) * done)),
+    ]
+    return ordered({"logs": pd.concat([part["logs"] for part in parts])})
 
 
 def over_folder(folder: Path, on_progress: Progress) -> dict[str, pd.DataFrame]:
