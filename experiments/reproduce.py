@@ -269,7 +269,7 @@ def reproduce_over(study: str, folder: Path) -> None:
     Raises
     ------
     InputError
-        If the study runs over no logs, or the folder or one of its logs is no good.
+        If the study does not run over logs, or the folder or one of its logs is damaged.
     """
     _chosen(study)
     module = _part(study, "study")

@@ -11,10 +11,10 @@ from experiments.calibration.from_log import calibrate_log
 from experiments.judging.jobs import Tables
 from experiments.judging.logs import GRAPHS, relations_of
 from experiments.runs.calibration import Wheels
-from experiments.studies.peers.logs import Case, _by_scans, methods_of, rows_of
+from experiments.studies.peers.logs import Case, case_by_scans, methods_of, rows_of
 from sim.formats import carmen
 
-LOGS = {"intel, edges": "intel", "fr079": "fr079"}  # their names in GRAPHS
+LOGS = {"intel, edges": "intel", "fr079": "fr079"}  # to the names of their graphs
 
 
 def case_of(name: str) -> Case:
@@ -23,7 +23,7 @@ def case_of(name: str) -> Case:
     blind = dataclasses.replace(logged, truth=None)
     as_logged = Wheels(gain_right=1.0, gain_left=1.0, track_m=logged.robot.track_m, delay_s=0.0)
     noise = dataclasses.replace(calibrate_log(blind).calibration, wheels=as_logged, sensors={})
-    return _by_scans(name, logged, relations_of(LOGS[name]), noise)
+    return case_by_scans(name, logged, relations_of(LOGS[name]), noise)
 
 
 def over_edges(name: str) -> Tables:

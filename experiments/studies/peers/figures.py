@@ -63,7 +63,9 @@ def errors(methods: pd.DataFrame) -> Figure:
         line[0].set_ylabel(f"{board[0]},\n{board[1]}", fontsize=8)
     for axes in rows[-1]:
         axes.set_xlabel("position RMSE, m", fontsize=8)
-    page.legend(handles=_legend(), loc="outside lower center", ncols=4, fontsize=8)
+    page.legend(
+        handles=_legend("Holm over all pairs"), loc="outside lower center", ncols=4, fontsize=8
+    )
     return page
 
 
@@ -79,9 +81,8 @@ def logs(table: pd.DataFrame) -> Figure:
     kinds = {name: part["reads"].iloc[0] for name, part in by_log.items()}
     names = sorted(by_log, key=lambda name: list(dict.fromkeys(kinds.values())).index(kinds[name]))
     ends = [a for a, b in pairwise([*names, None]) if b is None or kinds[a] != kinds[b]]
-    ratios = [1.0 + 1.3 * (name in ends) for name in names]  # room for the methods' names
-    page, rows = subplots(11.0, 0.8 + 1.35 * sum(ratios), len(names), 1, squeeze=False,
-                          height_ratios=ratios)  # fmt: skip
+    height = 0.8 + 1.35 * len(names) + 1.7 * len(ends)  # with room for the methods' names
+    page, rows = subplots(11.0, height, len(names), 1, squeeze=False)
     for axes, name in zip(rows[:, 0], names, strict=True):
         part, order = by_log[name], _order(here[here["reads"] == kinds[name]])
         _draw_log(axes, part, order)
@@ -89,7 +90,12 @@ def logs(table: pd.DataFrame) -> Figure:
         axes.set_xticks(range(len(order)), order if last else [], rotation=60, ha="right",
                         rotation_mode="anchor", fontsize=7)  # fmt: skip
         axes.set_ylabel(f"{name}\n{_KINDS.get(part['kind'].iloc[0], 'error')}, m", fontsize=8)
-    page.legend(handles=[*_legend(), _FAILED], loc="outside lower center", ncols=5, fontsize=8)
+    page.legend(
+        handles=[*_legend("Bonferroni"), _REVISED, _FAILED],
+        loc="outside lower center",
+        ncols=6,
+        fontsize=8,
+    )
     return page
 
 
@@ -118,6 +124,7 @@ def _draw_log(axes: Axes, part: pd.DataFrame, order: list[str]) -> None:
 
 _ANSWERS = {"online": "", "revised": ", revised"}
 _KINDS = {"relations": "relations", "fit to the map": "beams off walls"}
+_REVISED = Line2D([], [], color=WALL, ls="", marker="s", ms=6, label="revised path")
 _FAILED = Line2D([], [], color=WALL, ls="", marker="x", ms=6, label="failed")
 _ENDS = ("ate_low_m", "ate_high_m")
 
@@ -129,14 +136,14 @@ def _label(row: "pd.Series[str]") -> str:
     return f"{row['estimator'].removesuffix(TUNED)}{arm}{mapped}"
 
 
-def _legend() -> list[Line2D]:
-    """One entry a colour and a filling."""
+def _legend(test: str) -> list[Line2D]:
+    """One entry a colour and a filling; what is worse by a test."""
     return [
         Line2D([], [], color=color, mfc=filled, ls="", marker="o", ms=6, label=label)
         for label, color, filled in [
             ("ours", BLUE, BLUE),
             ("another project's", ORANGE, ORANGE),
             ("level with the best of its board", WALL, WALL),
-            ("worse (Holm over all pairs)", WALL, "white"),
+            (f"worse ({test})", WALL, "white"),
         ]
     ]

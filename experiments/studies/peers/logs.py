@@ -13,7 +13,6 @@ import functools
 import textwrap
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -35,20 +34,18 @@ from experiments.evaluation.metrics import (
 from experiments.evaluation.relations import counted, relation_errors
 from experiments.evaluation.statistics import block_interval
 from experiments.evaluation.time_sync import nearest_rows
-from experiments.judging.jobs import Progress, Tables, tables_of
+from experiments.judging.jobs import Tables
 from experiments.judging.logs import (
     CALIBRATED_S,
     DATA,
     calibrate_by_truth,
-    freiburg,
     intel,
     known_start,
     landmarks,
     relations_of,
     wean_hall,
-    why_missing,
 )
-from experiments.runs.calibration import Calibration, read_calibration
+from experiments.runs.calibration import Calibration
 from experiments.runs.evaluate import run_over, status_of
 from experiments.runs.experiment import Experiment
 from experiments.runs.processes import is_interrupt
@@ -70,13 +67,11 @@ from experiments.studies.peers.version import missing, sensor_of, version_of
 from experiments.studies.real_logs.grid_match import beam_points
 from experiments.sweeps.averages import MIN_UNITS
 from experiments.sweeps.plan import plan_experiments
-from experiments.trajectories.part import Part
 from sim import se2
 from sim.arrays import Array, Ints
-from sim.errors import InputError, naming, require
+from sim.errors import InputError, require
 from sim.formats import wean
-from sim.formats.detect import read_any
-from sim.formats.relations import Relations, read_relations
+from sim.formats.relations import Relations
 from sim.recording import Recording
 from sim.sensors import Laser, StereoCamera
 from sim.worlds.grid import OccupancyGrid
@@ -86,8 +81,6 @@ _BLOCK_S, _MIN_BLOCKS = 60.0, 10  # of errors that stay together; of a short log
 _RESAMPLES = 20_000
 _NEAR_S = 1e-3  # between a scan and the pose at it
 _EXPECTED_NEES = 3.0  # of a planar pose
-_BESIDE = (".relations", ".tum", ".md", ".txt", ".yaml", ".pgm")  # files that are no logs
-_PACKED = (".gz", ".xz")
 
 
 @dataclass(frozen=True)
@@ -142,7 +135,7 @@ class Case:
 # --- the logs ------------------------------------------------------------------------------------
 
 
-def _by_scans(
+def case_by_scans(
     name: str, logged: Recording, relations: Relations, found: Calibration | None = None
 ) -> Case:
     """A log with relations, calibrated by its own scans if that is not given."""
@@ -195,101 +188,10 @@ def _refined(recording: Recording, start: Array, grid: OccupancyGrid) -> Array:
 
 
 LOGS: dict[str, Callable[[], Case]] = {
-    "intel": lambda: _by_scans("intel", intel("logged"), relations_of("intel")),
-    "fr079": lambda: _by_scans("fr079", freiburg(), relations_of("fr079")),
+    "intel": lambda: case_by_scans("intel", intel("logged"), relations_of("intel")),
     **{f"wean {n}": functools.partial(_wean, n) for n in WEAN_STARTS},
     **{f"mrclam {robot}": functools.partial(_mrclam, robot) for robot in MRCLAM_ROBOTS},
 }
-
-
-def own_logs(folder: Path) -> list[Path]:
-    """Logs in a folder: its files and folders but for those that belong to one.
-
-    Raises
-    ------
-    InputError
-        If it is not a folder, or holds none.
-    """
-    require(folder.is_dir(), f"--logs {folder}: not a folder; name one that holds logs")
-    found = [
-        path
-        for path in sorted(folder.iterdir())
-        if not path.name.startswith(".") and _bare(path).suffix not in _BESIDE
-    ]
-    require(
-        bool(found),
-        f"--logs {folder}: holds no logs; put logs there (docs/formats.md), and beside LOG.npz "
-        "LOG.relations or LOG.tum to judge by",
-    )
-    return found
-
-
-def _bare(path: Path) -> Path:
-    """The path without what says that it is packed."""
-    return path.with_suffix("") if path.suffix in _PACKED else path
-
-
-def own_case(log: Path) -> Case:
-    """A user's log: of scans, or of landmarks with ids and a truth.
-
-    `NAME.relations` beside it (or packed) has its relations, `NAME.tum` its reference poses, and
-    `NAME.yaml` its calibration, where it cannot be calibrated by its own scans or landmarks.
-
-    Raises
-    ------
-    InputError
-        Naming the log, if it cannot be read or calibrated, or nothing judges it.
-    """
-    stem = _bare(log).stem.removesuffix(".tar")
-    beside = {
-        suffix: path
-        for suffix in (".relations", ".tum", ".yaml")
-        for path in (log.with_name(stem + suffix + packed) for packed in ("", *_PACKED))
-        if path.is_file()
-    }
-    with naming(log):
-        logged = read_any([log])
-        if ".tum" in beside:
-            logged = Part(truth=beside[".tum"]).of(logged)
-        lasers, cameras = names_of(logged, Laser), names_of(logged, StereoCamera)
-        require(
-            "laser" in lasers or "stereo" in cameras,
-            "has neither a laser `laser` nor a camera `stereo`; move it out of the folder",
-        )
-        require(
-            logged.truth is not None or ".relations" in beside,
-            f"nothing judges it; put {stem}.relations or {stem}.tum beside it",
-        )
-        by_scans = "laser" in lasers
-        try:
-            found = (
-                read_calibration(beside[".yaml"])
-                if ".yaml" in beside
-                else calibrate_log(
-                    dataclasses.replace(logged, truth=None) if by_scans else logged
-                ).calibration
-            )
-        except InputError as error:
-            raise InputError(
-                f"cannot be calibrated ({error}); put a calibration of its robot beside it, "
-                f"{stem}.yaml of `estima calibrate`"
-            ) from error
-        if ".relations" in beside:
-            return _by_scans(stem, logged, read_relations(beside[".relations"]), found)
-        return _by_poses(stem, logged, found)
-
-
-def _by_poses(name: str, logged: Recording, found: Calibration) -> Case:
-    """A log with reference poses, from the true start."""
-    calibrated = found.apply_to(logged)
-    moved = moved_base(logged, calibrated)
-    first = calibrated.truth_at(calibrated.frame_stamps[:1])[0]
-    require(
-        bool(np.isfinite(first).all()),
-        "its reference begins after its first Frame; cut it with `estima convert --from`",
-    )
-    start = known_start(calibrated, se2.compose(first, se2.inverse(moved)))
-    return Case(name, calibrated, found, start, POSES, moved)
 
 
 # --- what is judged ------------------------------------------------------------------------------
@@ -398,8 +300,8 @@ def methods_of(case: Case) -> Iterator[Experiment]:
 
 
 def over_log(name: str) -> Tables:
-    """Rows of all methods on one log: one of `LOGS`, or a file of the user's."""
-    case = LOGS[name]() if name in LOGS else own_case(Path(name))
+    """Rows of all methods on one of `LOGS`."""
+    case = LOGS[name]()
     return {"logs": rows_of(case, methods_of(case))}
 
 
@@ -510,25 +412,6 @@ def _judged(case: Case, row: Row, path: Estimate) -> tuple[Row, Errors | None]:
     }, found
 
 
-def judged_logs(on_progress: Progress) -> dict[str, pd.DataFrame]:
-    """The table of all methods over the logs of others.
-
-    Raises
-    ------
-    InputError
-        If they are not here.
-    """
-    if why := why_missing():
-        raise InputError(f"{why}; put them there, or name a folder of logs with --logs")
-    return _ordered(tables_of(over_log, [(name,) for name in LOGS], on_progress))
-
-
-def over_folder(folder: Path, on_progress: Progress) -> dict[str, pd.DataFrame]:
-    """The same table of a user's folder of logs."""
-    logs = own_logs(folder)
-    return _ordered(tables_of(over_log, [(str(log),) for log in logs], on_progress))
-
-
 _COLUMNS = (
     *("log", "sensor", "answer", "estimator", "arm", "project", "kind", "status", "level"),
     *("error_m", "error_low_m", "error_high_m", "error_rad", "nees_over_3"),
@@ -536,7 +419,7 @@ _COLUMNS = (
 )
 
 
-def _ordered(tables: dict[str, pd.DataFrame]) -> dict[str, pd.DataFrame]:
+def ordered(tables: dict[str, pd.DataFrame]) -> dict[str, pd.DataFrame]:
     """The table with its columns in order, infinite ends left out."""
     table = tables["logs"].reindex(columns=list(_COLUMNS))
     return {"logs": table.replace([np.inf, -np.inf], np.nan)}

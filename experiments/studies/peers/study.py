@@ -1,7 +1,5 @@
 """Methods of other projects beside ours, on the same drives through six classes of world."""
 
-from pathlib import Path
-
 import numpy as np
 import pandas as pd
 
@@ -17,9 +15,8 @@ from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Outcome, Row
 from experiments.studies.peers import edges
-from experiments.studies.peers.logs import LOGS, over_log, own_logs
-from experiments.studies.peers.logs import _ordered as ordered
-from experiments.studies.peers.logs import over_folder as over_logs_in
+from experiments.studies.peers.logs import LOGS, ordered, over_log
+from experiments.studies.peers.own_logs import over_folder as over_folder
 from experiments.studies.peers.settings import CLASSES, COMPETING, TUNED
 from experiments.studies.peers.version import missing, sensor_of, version_of
 from experiments.sweeps.averages import MIN_UNITS, averages
@@ -27,7 +24,6 @@ from experiments.sweeps.plan import plan_experiments
 from experiments.sweeps.tune import FAILED_M
 from experiments.sweeps.winner import differing_pairs
 from sim.errors import InputError
-from sim.formats.detect import kind_of
 
 _ERROR = "ate_rmse_m"
 _SCORES = (_ERROR, "heading_rmse_rad", "nees_mean", "unused_share")
@@ -64,29 +60,13 @@ def over_logs(_profile: Profile, on_progress: Progress) -> dict[str, pd.DataFram
     if why := why_missing():
         raise InputError(f"{why}; put them there, or name a folder of logs with --logs")
     by_edges = [(name,) for name in edges.LOGS]
-    by_wheels = [(name,) for name in LOGS if name not in edges.LOGS]
+    by_wheels = [(name,) for name in LOGS]
     share = len(by_edges) / len(by_edges + by_wheels)
     parts = [
         tables_of(edges.over_edges, by_edges, lambda done: on_progress(share * done)),
         tables_of(over_log, by_wheels, lambda done: on_progress(share + (1.0 - share) * done)),
     ]
     return ordered({"logs": pd.concat([part["logs"] for part in parts])})
-
-
-def over_folder(folder: Path, on_progress: Progress) -> dict[str, pd.DataFrame]:
-    """The same table of a user's folder of logs.
-
-    Raises
-    ------
-    InputError
-        If something in it is no log, before any method runs; or cannot be read.
-    """
-    for log in own_logs(folder):
-        try:
-            kind_of(log)
-        except InputError as error:
-            raise InputError(f"{error}; move it out of the folder of --logs") from error
-    return over_logs_in(folder, on_progress)
 
 
 PARTS = {"logs": over_logs}

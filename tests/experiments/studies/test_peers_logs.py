@@ -14,7 +14,7 @@ from experiments.evaluation.relations import relation_scores
 from experiments.judging.logs import freiburg, relations_of, why_missing
 from experiments.judging.results import Results
 from experiments.runs.calibration import Calibration, Slip, Wheels, write_calibration
-from experiments.studies.peers import figures, logs, study
+from experiments.studies.peers import figures, logs, own_logs
 from experiments.studies.peers.settings import CAP_M, LASER, WEAN_STARTS
 from experiments.studies.peers.version import missing
 from sim import se2
@@ -74,9 +74,9 @@ def methods(case, *names):
 
 
 def test_a_users_folder_of_logs(folder):
-    assert [path.name for path in logs.own_logs(folder)] == ["hall.npz", "room.npz"]
-    for path, kind in zip(logs.own_logs(folder), (logs.POSES, logs.RELATIONS), strict=True):
-        case = logs.own_case(path)
+    assert [path.name for path in own_logs.own_logs(folder)] == ["hall.npz", "room.npz"]
+    for path, kind in zip(own_logs.own_logs(folder), (logs.POSES, logs.RELATIONS), strict=True):
+        case = own_logs.own_case(path)
         rows = logs.rows_of(case, methods(case, "odometry", "ekf_icp", "graph_slam"))
         assert {row["kind"] for row in rows} == {kind}
         assert [row["status"] for row in rows] == ["ok"] * 4
@@ -89,7 +89,7 @@ def test_a_users_folder_of_logs(folder):
 
 
 def test_every_method_believes_the_calibrated_noise(folder):
-    case = logs.own_case(folder / "room.npz")
+    case = own_logs.own_case(folder / "room.npz")
     methods(case)
     slip = case.calibration.slip
     told = [one for one in COMPOSED[slip.kr] if one.believed_slip is not None]
@@ -98,7 +98,7 @@ def test_every_method_believes_the_calibrated_noise(folder):
 
 
 def test_its_errors_are_those_of_the_metric(folder):
-    case = logs.own_case(folder / "room.npz")
+    case = own_logs.own_case(folder / "room.npz")
     drifting = case.prior.mean + np.linspace(0.0, 0.3, len(case.recording.frame_stamps))[:, None]
     path = Estimate(case.recording.frame_stamps, drifting, np.zeros((len(drifting), 3, 3)))
     found = logs.errors_of(case, path)
@@ -113,7 +113,7 @@ def test_evo_finds_the_same_errors(folder):
     metrics = pytest.importorskip("evo.core.metrics")
     from evo.core.trajectory import PoseTrajectory3D
 
-    case = logs.own_case(folder / "hall.npz")
+    case = own_logs.own_case(folder / "hall.npz")
     for one in methods(case, "odometry", "ekf_icp", "icp_odometry", "graph_slam", "small_gicp"):
         if missing(one):
             continue
@@ -145,26 +145,27 @@ def test_a_bad_folder_or_log_is_one_line_with_its_remedy(tmp_path, folder):
         tmp_path / "nowhere": "not a folder; name one that holds logs",
     }.items():
         with pytest.raises(InputError, match=said):
-            logs.own_logs(wrong)
+            own_logs.own_logs(wrong)
     empty = tmp_path / "empty"
     empty.mkdir()
     with pytest.raises(InputError, match="holds no logs; put logs there"):
-        logs.own_logs(empty)
+        own_logs.own_logs(empty)
+    empty.rmdir()
     (folder / "shopping.csv").write_text("milk\n")
     with pytest.raises(InputError, match=r"shopping.csv: not a log .* move it out of the folder"):
-        study.over_folder(folder, lambda _: None)
+        own_logs.over_folder(folder, lambda _: None)
     (folder / "room.yaml").unlink()
     with pytest.raises(InputError, match=r"room.npz: cannot be calibrated .*room.yaml of `estima"):
-        logs.own_case(folder / "room.npz")
+        own_logs.own_case(folder / "room.npz")
     (folder / "room.relations").unlink()
     with pytest.raises(InputError, match=r"room.npz: .*put room.relations or room.tum beside it"):
-        logs.own_case(folder / "room.npz")
+        own_logs.own_case(folder / "room.npz")
     with pytest.raises(InputError, match="mcl_office runs over no logs; take --paper peers"):
         reproduce.reproduce_over("mcl_office", folder)
 
 
 def test_a_method_that_fails_has_a_row_with_the_reason(folder, monkeypatch):
-    case = logs.own_case(folder / "room.npz")
+    case = own_logs.own_case(folder / "room.npz")
 
     def broken(*_, **__):
         raise RuntimeError("out of luck")
@@ -231,7 +232,7 @@ def part_of_fr079():
         values={name: values[kept] for name, values in scans.values.items()},
     )
     part = dataclasses.replace(part, logs={"laser": short})
-    return logs._by_scans("fr079", part, relations_of("fr079"))
+    return logs.case_by_scans("fr079", part, relations_of("fr079"))
 
 
 def error_m(case, name):
