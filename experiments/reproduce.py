@@ -28,7 +28,7 @@ from experiments.judging.claims_file import (
 from experiments.judging.folders import LOGS, OWN, STUDIES, SWEEPS, findings
 from experiments.judging.folders import part as _part
 from experiments.judging.jobs import in_parallel
-from experiments.judging.logs import why_missing
+from experiments.judging.logs import DATA, why_missing
 from experiments.judging.results import Profile, Results, reproduce_command
 from experiments.judging.sentences import Conclusion, conclude
 from experiments.report.page import write_report
@@ -37,9 +37,11 @@ from experiments.runs.dependencies.recorder import digest_of_all, recorded
 from experiments.runs.evaluate import limit_blas
 from experiments.runs.paths import results, short
 from experiments.viewing.style import save_figure
-from sim.errors import InputError, nearest
+from sim.errors import InputError, nearest, require
 
-_APART = "_tuning"  # the table on other seeds from which parameters were chosen
+# Tables that a command of their own makes: on other seeds, from which parameters were chosen, and
+# over real logs
+_APART = ("_tuning", "peers_logs")
 _AGAIN = "reproduced"  # folder in the results
 Items = dict[str, tuple[dict[str, str], float]]  # dependencies and seconds, by name
 
@@ -141,7 +143,11 @@ def renew(only: str | None = None) -> None:
     stale = [each for each in list_built(results()) if each.state is not State.FRESH]
     chosen = {only} if only is not None else {*STUDIES}
     for study in [s for s in STUDIES if s in chosen]:
-        own = [each for each in stale if each.study == study and _APART not in each.name]
+        own = [
+            each
+            for each in stale
+            if each.study == study and not Path(each.name).stem.endswith(_APART)
+        ]
         if not own:
             continue
         if study in LOGS and (why := why_missing()):
@@ -254,6 +260,32 @@ def reproduce_part(study: str, name: str) -> list[Conclusion]:
     note_built(place, study, items | verdicts)
     shutil.rmtree(seen.keep_in, ignore_errors=True)
     return conclusions
+
+
+def reproduce_over(study: str, folder: Path) -> None:
+    """Run a study's methods over a folder of logs; a table and a figure in `results/logs/NAME`.
+
+    Of the logs that the project knows they are the judged ones.
+
+    Raises
+    ------
+    InputError
+        If the study does not run over logs, or the folder or one of its logs is damaged.
+    """
+    _chosen(study)
+    module = _part(study, "study")
+    able = [each for each in OWN if hasattr(_part(each, "study"), "over_folder")]
+    require(study in able, f"--logs: {study} runs over no logs; take --paper {' or '.join(able)}")
+    if folder.resolve() == DATA.resolve() and not why_missing():
+        reproduce_part(study, "logs")
+        show(short(results() / "tables" / f"{study}_logs.csv"))
+        return
+    made = Results(results() / "logs" / folder.resolve().name, study)
+    with progress(f"{study}: {folder.name}", 1.0) as on_progress:
+        made.write_tables(**module.over_folder(folder, on_progress))
+    _draw(made)
+    for path in sorted(made.folder.glob("*/*")):
+        show(short(path))
 
 
 def _count(folder: Path) -> str:

@@ -26,7 +26,7 @@ from matplotlib.figure import Figure
 from estimators.base import Estimate, Prior
 from estimators.graph.graph_slam import GraphSlam
 from experiments.calibration.files import residual_figure
-from experiments.calibration.from_log import LogCalibration, calibrate_log
+from experiments.calibration.from_log import LogCalibration, calibrate_log, moved_base
 from experiments.calibration.log_check import check_calibration, check_clocks
 from experiments.calibration.reference import names_of
 from experiments.evaluation.metrics import SCORED_EXTRAS, path_scores, travelled_m, unused_share
@@ -194,7 +194,7 @@ def solve(
             _both(interrupt, on_step),
         )
     interrupt()
-    T_base_logged = _moved_base(blind, calibrated, lasers)
+    T_base_logged = moved_base(blind, calibrated)
     path = revised or online
     alone, closures = None, np.zeros((0, 2))
     if isinstance(estimator, GraphSlam):
@@ -232,14 +232,6 @@ def _options(found: LogCalibration | None, lasers: list[str], cameras: list[str]
         options += [f"robot.kr={slip.kr}", f"robot.kl={slip.kl}"]
         options.append(f"estimator.forward_slip_m={slip.forward_slip_m}")
     return options
-
-
-def _moved_base(logged: Recording, calibrated: Recording, lasers: list[str]) -> Array:
-    """Pose (3,) of the log's base_link in the calibrated one: the laser is where it was."""
-    if not lasers:
-        return np.zeros(3)
-    before, after = (one.sensor(lasers[0], Laser).mount.pose for one in (logged, calibrated))
-    return se2.compose(after, se2.inverse(before))
 
 
 def _carried(path: Estimate, T_base_other: Array) -> Estimate:

@@ -112,6 +112,15 @@ def calibrate_log(
     return dataclasses.replace(found, calibration=calibration)
 
 
+def moved_base(logged: Recording, calibrated: Recording) -> Array:
+    """Pose (3,) of the log's base_link in the calibrated one: the first laser is where it was."""
+    lasers = names_of(logged, Laser)
+    if not lasers:
+        return np.zeros(3)
+    before, after = (one.sensor(lasers[0], Laser).mount.pose for one in (logged, calibrated))
+    return se2.compose(after, se2.inverse(before))
+
+
 def calibrate_against(reference: Reference, part: Recording) -> LogCalibration:
     """Calibrate a robot by a log whose reference is at hand.
 

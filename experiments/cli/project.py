@@ -31,6 +31,13 @@ def reproduce(
     figures_only: Annotated[
         bool, typer.Option("--figures-only", help="Redraw the figures from the tables in results/.")
     ] = False,
+    logs: Annotated[
+        Path | None,
+        typer.Option(
+            help="With --paper peers: run its methods over the logs in this folder.",
+            metavar="FOLDER",
+        ),
+    ] = None,
     minutes: Annotated[float, typer.Option(help="About how long the audit takes.")] = 2.0,
 ) -> None:
     """Check the judged results: audit them, redraw the figures, judge the claims; code 1 if not so.
@@ -46,6 +53,8 @@ def reproduce(
       estima reproduce --paper gil2008 --full --part divergence
 
       estima reproduce --stale
+
+      estima reproduce --paper peers --logs my_logs
     """
     from experiments import reproduce as made
 
@@ -53,6 +62,14 @@ def reproduce(
         full + stale + figures_only <= 1, "--full, --stale and --figures-only: give one of them"
     )
     require(part is None or (full and paper is not None), "--part: needs --paper and --full")
+    if logs is not None:
+        require(paper is not None, "--logs: needs a study that runs over logs; add --paper peers")
+        require(
+            not (full or stale or figures_only),
+            "--logs: makes one table; leave out --full, --stale and --figures-only",
+        )
+        made.reproduce_over(paper or "", logs)
+        return
     if figures_only:
         made.redraw(only=paper)
     elif stale:

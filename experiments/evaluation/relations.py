@@ -66,7 +66,19 @@ def judged_relations(
 def relation_scores(
     recording: Recording, relations: Relations, stamps: Array, poses: Array
 ) -> dict[str, float]:
-    """Mean errors of poses (T, 3) at stamps (T,) by a log's relations, as columns of a row.
+    """Mean errors of poses (T, 3) at stamps (T,) by a log's relations, as columns of a row."""
+    found = relation_errors(*counted(recording, relations, stamps, poses)).summary()
+    return {
+        "n_relations": found["n_relations"],
+        "relation_translation_m": found["translation_mean_m"],
+        "relation_rotation_rad": found["rotation_mean_rad"],
+    }
+
+
+def counted(
+    recording: Recording, relations: Relations, stamps: Array, poses: Array
+) -> tuple[Relations, Array, Array]:
+    """Those of a log's relations, and of poses (T, 3) at stamps (T,), that count.
 
     Poses at scans count where there are such; of a log that was thinned, only those at scans whose
     stamps are known.
@@ -82,12 +94,7 @@ def relation_scores(
             "stamps_known of the recording must be rows of its scans",
         )
         relations = judged_relations(relations, log.stamps[rows])
-    found = relation_errors(relations, stamps, poses).summary()
-    return {
-        "n_relations": found["n_relations"],
-        "relation_translation_m": found["translation_mean_m"],
-        "relation_rotation_rad": found["rotation_mean_rad"],
-    }
+    return relations, stamps, poses
 
 
 def relation_errors(

@@ -162,3 +162,33 @@ def log_ratios(first: ArrayLike, second: ArrayLike) -> Array:
             "runs that failed, in both arms"
         )
     return np.asarray(np.log(above) - np.log(below))
+
+
+def blocks_of(stamps: Array, block_s: float = 60.0) -> Array:
+    """Number (N,) of the block of so many seconds that each stamp (N,) falls in."""
+    return np.asarray(np.floor((stamps - stamps.min()) / block_s))
+
+
+def block_interval(
+    errors: Array,
+    stamps: Array,
+    *,
+    block_s: float = 60.0,
+    share: float = 0.95,
+    n_resamples: int = 2000,
+) -> Interval:
+    """Mean of errors (N,), with its bootstrap interval; those of a block stay together.
+
+    Parameters
+    ----------
+    stamps
+        (N,) s, when each error begins.
+    share
+        Of the resampled means that the interval holds.
+    """
+    _, blocks = np.unique(blocks_of(stamps, block_s), return_inverse=True)
+    sums, counts = np.bincount(blocks, errors), np.bincount(blocks)
+    picks = np.random.default_rng(0).integers(len(sums), size=(n_resamples, len(sums)))
+    means = sums[picks].sum(axis=1) / counts[picks].sum(axis=1)
+    low, high = np.quantile(means, [0.5 - share / 2.0, 0.5 + share / 2.0])
+    return Interval(float(np.mean(errors)), float(low), float(high))

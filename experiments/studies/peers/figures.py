@@ -1,24 +1,35 @@
 """Figure of the study of peers: errors by class of world, with intervals and ties."""
 
+from itertools import pairwise
+
 import numpy as np
 import pandas as pd
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from experiments.judging.results import Results
 from experiments.studies.peers.settings import CLASSES, LASER, MAP, STEREO, TUNED
-from experiments.studies.peers.study import is_ours
+from experiments.studies.peers.version import is_ours
 from experiments.viewing.plotting import set_axes
 from experiments.viewing.style import BLUE, ORANGE, WALL, subplots
 
 _BOARDS = [(s, a) for s in (LASER, MAP, STEREO) for a in ("online", "revised")]
 _ENDS = ("ate_low_m", "ate_high_m")
+_ANSWERS = {"online": "", "revised": ", revised"}
+_KINDS = {"relations": "relations", "fit to the map": "beams off walls"}
+_REVISED = Line2D([], [], color=WALL, ls="", marker="s", ms=6, label="revised path")
+_FAILED = Line2D([], [], color=WALL, ls="", marker="x", ms=6, label="failed")
 _PLACES = {"all classes": "", **{name: f"_{name}" for name in CLASSES}}
 
 
 def draw(results: Results) -> dict[str, Figure]:
-    """Draw the study's figure."""
-    return {"peers_errors": errors(results.table("methods"))}
+    """Draw the study's figures of those tables that are there."""
+    over_logs = results.optional_table("logs")
+    drawn = {} if over_logs is None else {"peers_logs": logs(over_logs)}
+    if over_logs is None or results.optional_table("methods") is not None:
+        drawn["peers_errors"] = errors(results.table("methods"))
+    return drawn
 
 
 def errors(methods: pd.DataFrame) -> Figure:
@@ -57,8 +68,63 @@ def errors(methods: pd.DataFrame) -> Figure:
         line[0].set_ylabel(f"{board[0]},\n{board[1]}", fontsize=8)
     for axes in rows[-1]:
         axes.set_xlabel("position RMSE, m", fontsize=8)
-    page.legend(handles=_legend(), loc="outside lower center", ncols=4, fontsize=8)
+    page.legend(
+        handles=_legend("Holm over all pairs"), loc="outside lower center", ncols=4, fontsize=8
+    )
     return page
+
+
+def logs(table: pd.DataFrame) -> Figure:
+    """Draw the error of each method on each log, a row a log, those of one kind side by side.
+
+    Methods stand in the order of their errors, as means of logs. One that failed has a cross.
+    """
+    here = table[table["status"] != "missing"].copy()
+    here["method"] = [_label(row) + _ANSWERS[row["answer"]] for _, row in here.iterrows()]
+    here["reads"] = np.where(here["sensor"] == MAP, LASER, here["sensor"])
+    by_log = dict(list(here.groupby("log", sort=False)))
+    kinds = {name: part["reads"].iloc[0] for name, part in by_log.items()}
+    names = sorted(by_log, key=lambda name: list(dict.fromkeys(kinds.values())).index(kinds[name]))
+    ends = [a for a, b in pairwise([*names, None]) if b is None or kinds[a] != kinds[b]]
+    height = 0.8 + 1.35 * len(names) + 1.7 * len(ends)  # with room for the methods' names
+    page, rows = subplots(11.0, height, len(names), 1, squeeze=False)
+    for axes, name in zip(rows[:, 0], names, strict=True):
+        part, order = by_log[name], _order(here[here["reads"] == kinds[name]])
+        _draw_log(axes, part, order)
+        last = name in ends
+        axes.set_xticks(range(len(order)), order if last else [], rotation=60, ha="right",
+                        rotation_mode="anchor", fontsize=7)  # fmt: skip
+        axes.set_ylabel(f"{name}\n{_KINDS.get(part['kind'].iloc[0], 'error')}, m", fontsize=8)
+    page.legend(
+        handles=[*_legend("Bonferroni"), _REVISED, _FAILED],
+        loc="outside lower center",
+        ncols=6,
+        fontsize=8,
+    )
+    return page
+
+
+def _order(part: pd.DataFrame) -> list[str]:
+    """Methods by their geometric mean errors, ours and others' alike; those without one last."""
+    means = np.log(part["error_m"].astype(float)).groupby(part["method"]).mean()
+    return [str(name) for name in means.sort_values(na_position="last").index]
+
+
+def _draw_log(axes: Axes, part: pd.DataFrame, order: list[str]) -> None:
+    """Draw errors (m, on a log axis) of the methods of a log over their places in an order."""
+    for _, row in part.iterrows():
+        x, colour = order.index(row["method"]), BLUE if is_ours(row["estimator"]) else ORANGE
+        if not np.isfinite(row["error_m"]):
+            axes.plot(x, 0.93, "x", color=colour, transform=axes.get_xaxis_transform())
+            continue
+        ends = row[["error_low_m", "error_high_m"]].astype(float)
+        axes.plot([x, x], ends, color=colour, lw=1.2)
+        mark = "s" if row["answer"] == "revised" else "o"
+        axes.plot(
+            x, row["error_m"], mark, ms=5, color=colour, mfc=colour if row["level"] else "white"
+        )
+    set_axes(axes, yscale="log", xlim=(-0.7, len(order) - 0.3))
+    axes.grid(axis="x", color="0.92")
 
 
 def _label(row: "pd.Series[str]") -> str:
@@ -68,14 +134,14 @@ def _label(row: "pd.Series[str]") -> str:
     return f"{row['estimator'].removesuffix(TUNED)}{arm}{mapped}"
 
 
-def _legend() -> list[Line2D]:
-    """One entry a colour and a filling."""
+def _legend(test: str) -> list[Line2D]:
+    """One entry a colour and a filling; what is worse by a test."""
     return [
         Line2D([], [], color=color, mfc=filled, ls="", marker="o", ms=6, label=label)
         for label, color, filled in [
             ("ours", BLUE, BLUE),
             ("another project's", ORANGE, ORANGE),
             ("level with the best of its board", WALL, WALL),
-            ("worse (Holm over all pairs)", WALL, "white"),
+            (f"worse ({test})", WALL, "white"),
         ]
     ]

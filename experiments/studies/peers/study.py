@@ -1,14 +1,11 @@
 """Methods of other projects beside ours, on the same drives through six classes of world."""
 
-import importlib.metadata
-import subprocess
-
 import numpy as np
 import pandas as pd
 
-from estimators.peers import MissingPackageError
 from experiments.evaluation.statistics import log_ratio_interval
 from experiments.judging.jobs import Progress, Tables, group_by, tables_of
+from experiments.judging.logs import why_missing
 from experiments.judging.remake import Cells, Remake
 from experiments.judging.results import Profile, Results
 from experiments.runs.columns import REVISED
@@ -17,11 +14,16 @@ from experiments.runs.console import warn
 from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Outcome, Row
-from experiments.studies.peers.settings import CLASSES, COMPETING, LASER, PACKAGES, READS, TUNED
+from experiments.studies.peers import edges
+from experiments.studies.peers.logs import LOGS, ordered, over_log
+from experiments.studies.peers.own_logs import over_folder as over_folder
+from experiments.studies.peers.settings import CLASSES, COMPETING, TUNED
+from experiments.studies.peers.version import missing, sensor_of, version_of
 from experiments.sweeps.averages import MIN_UNITS, averages
 from experiments.sweeps.plan import plan_experiments
 from experiments.sweeps.tune import FAILED_M
 from experiments.sweeps.winner import differing_pairs
+from sim.errors import InputError
 
 _ERROR = "ate_rmse_m"
 _SCORES = (_ERROR, "heading_rmse_rad", "nees_mean", "unused_share")
@@ -53,6 +55,21 @@ def run(profile: Profile, out: Results, on_progress: Progress) -> None:
         out.write_tables(missing=named)
 
 
+def over_logs(_profile: Profile, on_progress: Progress) -> dict[str, pd.DataFrame]:
+    """The table of all methods over the logs of others."""
+    if why := why_missing():
+        raise InputError(f"{why}; put them there, or name a folder of logs with --logs")
+    by_edges = [(name,) for name in edges.LOGS]
+    by_wheels = [(name,) for name in LOGS]
+    share = len(by_edges) / len(by_edges + by_wheels)
+    parts = [
+        tables_of(edges.over_edges, by_edges, lambda done: on_progress(share * done)),
+        tables_of(over_log, by_wheels, lambda done: on_progress(share + (1.0 - share) * done)),
+    ]
+    return ordered({"logs": pd.concat([part["logs"] for part in parts])})
+
+
+PARTS = {"logs": over_logs}
 REMADE = {"runs": 8.0}  # methods are means of them
 
 
@@ -64,21 +81,6 @@ def remake(_table: str, row: Cells) -> Remake | None:
         if (one.label("arm"), one.estimator_name) == (row["arm"], row["estimator"]):
             return None if missing(one) else (runs, ([one],))
     return None
-
-
-def missing(experiment: Experiment) -> str:
-    """Why a peer cannot run here; empty if it can.
-
-    Raises
-    ------
-    InputError
-        If the configuration is wrong.
-    """
-    try:
-        experiment.check()
-    except MissingPackageError as error:
-        return str(error)
-    return ""
 
 
 def runs(drive: list[Experiment]) -> Tables:
@@ -176,26 +178,3 @@ def best_where(found: pd.DataFrame, sensor: str, answer: str) -> dict[str, list[
     places = {"": "level", **{name: f"level_{name}" for name in CLASSES}}
     named = part["estimator"].str.removesuffix(TUNED) + " (" + part["arm"] + ")"
     return {place: list(named[part[column].astype(bool)]) for place, column in places.items()}
-
-
-def sensor_of(name: str) -> str:
-    """What a method reads beside the wheels."""
-    return READS.get(name.removesuffix(TUNED), LASER)
-
-
-def is_ours(name: str) -> bool:
-    """Whether a method belongs to this project."""
-    return name.removesuffix(TUNED) not in PACKAGES
-
-
-def version_of(name: str) -> str:
-    """A peer's package and version; `Estima` for ours."""
-    if is_ours(name):
-        return "Estima"
-    package = PACKAGES[name.removesuffix(TUNED)]
-    if package == "mrpt":
-        said = subprocess.run(
-            ["build/peers/mrpt", "version"], capture_output=True, text=True, check=False, timeout=10
-        )
-        return said.stdout.strip() or package
-    return f"{package} {importlib.metadata.version(package)}"

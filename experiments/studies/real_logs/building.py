@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from estimators.base import Estimate
 from estimators.graph.graph_slam import GraphSlam
 from estimators.odometry import Odometry
+from experiments.calibration.from_log import moved_base
 from experiments.evaluation.relations import judged_relations, relation_errors
 from experiments.judging.logs import (
     GRAPHS,
@@ -35,7 +36,6 @@ from sim import se2
 from sim.arrays import Array
 from sim.formats import carmen
 from sim.recording import Recording
-from sim.sensors import Laser
 
 _ORIGIN = np.zeros(3)
 # Of the Intel robot, as for `ekf_icp`
@@ -96,8 +96,7 @@ def closed_loops() -> tuple[pd.DataFrame, dict[str, NDArray[Any]]]:
     before, _ = track(Odometry(), edges)
     rows += scored("fr079", "SEQUENTIAL edges", freiburg())[0]
     wheels, logged = intel("calibrated"), intel("logged")
-    mounts = [one.sensor("laser", Laser).mount.pose for one in (wheels, logged)]
-    T_base_logged = se2.compose(mounts[0], se2.inverse(mounts[1]))  # calibration moved base_link
+    T_base_logged = moved_base(logged, wheels)
     known = intel_known_stamps(wheels)
     rows += scored("intel", "wheels, calibrated", wheels, known, T_base_logged, **_WHEELED)[0]
     return pd.DataFrame(rows), _grids(edges, before=before, after=after)

@@ -19,6 +19,7 @@ from experiments.calibration.logs import (
 )
 from experiments.evaluation.metrics import score, travelled_m
 from experiments.evaluation.relations import relation_errors
+from experiments.evaluation.statistics import block_interval, blocks_of
 from experiments.evaluation.time_sync import aligned_ate_m
 from experiments.judging.jobs import Progress, Tables, in_parallel
 from experiments.judging.logs import (
@@ -214,22 +215,15 @@ def _relation_rows(
             _, i, j = np.intersect1d(ours.rows, found.rows, return_indices=True)
             lower_m = ours.translation_m[i] - found.translation_m[j]
             row["difference_mean_m"] = float(lower_m.mean())
-            row["difference_minutes"] = len(np.unique(_minutes(begun[j])))
+            row["difference_minutes"] = len(np.unique(blocks_of(begun[j])))
             row |= _block_interval("difference", lower_m, begun[j])
         yield row
 
 
-def _minutes(stamps: Array) -> Array:
-    return np.asarray(np.floor((stamps - stamps.min()) / 60.0))
-
-
 def _block_interval(name: str, errors: Array, stamps: Array) -> dict[str, float]:
     """95 % bootstrap interval of a mean; relations that begin in the same minute stay together."""
-    _, blocks = np.unique(_minutes(stamps), return_inverse=True)
-    sums, counts = np.bincount(blocks, errors), np.bincount(blocks)
-    picks = np.random.default_rng(0).integers(len(sums), size=(2000, len(sums)))
-    low, high = np.quantile(sums[picks].sum(axis=1) / counts[picks].sum(axis=1), [0.025, 0.975])
-    return {f"{name}_low_m": float(low), f"{name}_high_m": float(high)}
+    found = block_interval(errors, stamps)
+    return {f"{name}_low_m": found.low, f"{name}_high_m": found.high}
 
 
 def _path(poses: Array) -> NDArray[np.float32]:

@@ -13,7 +13,7 @@ from experiments.judging.results import Profile, Results
 from experiments.runs.experiment import Experiment
 from experiments.studies.peers import figures, study
 from experiments.studies.peers.settings import CLASSES
-from experiments.studies.peers.study import is_ours
+from experiments.studies.peers.version import is_ours
 
 ROOT = Path(__file__).resolve().parents[3]
 ARMS = {  # error by estimator and arm, m

@@ -1,0 +1,46 @@
+"""What a method of the study is: whose, of which version, what it reads, and whether it is here."""
+
+import importlib.metadata
+import subprocess
+
+from estimators.peers import MissingPackageError
+from experiments.runs.experiment import Experiment
+from experiments.studies.peers.settings import LASER, PACKAGES, READS, TUNED
+
+
+def missing(experiment: Experiment) -> str:
+    """Why a peer cannot run here; empty if it can.
+
+    Raises
+    ------
+    InputError
+        If the configuration is wrong.
+    """
+    try:
+        experiment.check()
+    except MissingPackageError as error:
+        return str(error)
+    return ""
+
+
+def sensor_of(name: str) -> str:
+    """What a method reads beside the wheels."""
+    return READS.get(name.removesuffix(TUNED), LASER)
+
+
+def is_ours(name: str) -> bool:
+    """Whether a method belongs to this project."""
+    return name.removesuffix(TUNED) not in PACKAGES
+
+
+def version_of(name: str) -> str:
+    """A peer's package and version; `Estima` for ours."""
+    if is_ours(name):
+        return "Estima"
+    package = PACKAGES[name.removesuffix(TUNED)]
+    if package == "mrpt":
+        said = subprocess.run(
+            ["build/peers/mrpt", "version"], capture_output=True, text=True, check=False, timeout=10
+        )
+        return said.stdout.strip() or package
+    return f"{package} {importlib.metadata.version(package)}"
