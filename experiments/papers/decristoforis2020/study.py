@@ -25,13 +25,13 @@ from experiments.evaluation.metrics import (
     position_errors_m,
 )
 from experiments.judging.claim import Claim
-from experiments.judging.free_settings import free_settings
 from experiments.judging.jobs import Progress, Tables, group_by, tables_of
 from experiments.judging.logs import DATA
 from experiments.judging.region_runs import region_jobs, remake_region
 from experiments.judging.remake import Cells, Remake
 from experiments.judging.results import FIRST_SEED, Profile, Results
 from experiments.judging.sequential import run_worlds
+from experiments.papers.decristoforis2020.anchor import anchored, overrides_at
 from experiments.papers.decristoforis2020.claims import (
     closed_form_against_hessian,
     dc1,
@@ -48,16 +48,12 @@ from experiments.papers.decristoforis2020.pairs import (
 )
 from experiments.papers.decristoforis2020.settings import (
     CHECKED,
-    HALVINGS,
     N_GEOMETRIES,
     N_REPEATS,
     NEES_AT_M,
-    ONE_DEGREE_BEAMS,
     PAIRS,
     PAPERS_OWN,
     PLACES,
-    QUARTER_HZ,
-    TURNS_HZ,
 )
 from experiments.papers.decristoforis2020.steps import (
     ellipse_path,
@@ -173,24 +169,6 @@ def _pairs(seeds: Sequence[int]) -> list[Call]:
     return [(metrics_of, seed, kind, DEFAULT_RULES) for seed in seeds for kind in PAIRS]
 
 
-def anchored(claim: str) -> list[str]:
-    """Overrides of the configuration at a claim's anchor."""
-    anchor = free_settings("decristoforis2020")[claim].anchor
-    return overrides_at(anchor.settings if anchor else {})
-
-
-def overrides_at(values: Mapping[str, Any]) -> list[str]:
-    """Overrides at free settings: both wheels slip alike, and the laser has its beams' turns."""
-    given = [f"{name}={value}" for name, value in values.items() if name != HALVINGS]
-    if "robot.kr" in values:
-        given.append(f"robot.kl={values['robot.kr']}")
-    if HALVINGS in values:
-        rate_hz = TURNS_HZ / 2.0 ** int(values[HALVINGS])
-        given.append(f"sensors.laser.rate_hz={rate_hz}")
-        given += [f"sensors.laser.n_beams={ONE_DEGREE_BEAMS}"] * (rate_hz > QUARTER_HZ)
-    return given
-
-
 def region_run(name: str, values: Mapping[str, Any], seed: int, profile: Profile) -> Row:
     """Levels of a claim's arms at free settings in one world."""
     if name == "DC4":
@@ -272,13 +250,13 @@ REMADE = {
     "runs": 25.0,
     "steps": 25.0,
     "covariances": 3.0,
+    "closed_form": 8.0,
     "ellipses": 3.5,
     "beliefs": 10.0,
     "metrics": 0.1,
     "region_DC1": 8.0,
-    "region_DC2": 2.0,
-    "region_DC3": 2.0,
-    "region_DC4": 2.0,
+    "region_DC4": 8.0,
+    **dict.fromkeys(("region_DC2", "region_DC3"), 2.0),
     "region_DC5": 0.1,
 }  # not pooled errors, and what only figures show
 
@@ -292,6 +270,8 @@ def remake(table: str, row: Cells) -> Remake:
         return covariances_of, (int(seed), row["place"], N_REPEATS)
     if table == "metrics":
         return metrics_of, (int(seed), row["class"], DEFAULT_RULES)
+    if table == "closed_form":
+        return closed_form_of, (int(seed), N_REPEATS)
     study, label, function, named = _RUN_BY[table]
     given = [f"seed={seed}", *(f"{key}={row[name]:g}" for name, key in named.items())]
     if row.get("rays") == "bullet":
