@@ -25,6 +25,7 @@ from experiments.judging.results import Profile
 from experiments.judging.sentences import Conclusion
 from experiments.report import contents, leaderboard
 from experiments.report import page as report
+from experiments.runs.paths import SOURCE
 from experiments.runs.row import write_frame
 from experiments.viewing.style import save_figure, subplots
 from sim.errors import InputError
@@ -160,6 +161,17 @@ def test_each_claim_is_one_row_with_its_statistics_below(text):
     places = [text.index(f'id="{name}"') for name in ("puzzlebot2024", *order)]
     assert places == sorted(places)
     assert text.index('id="leaderboard"') < places[0]
+
+
+@pytest.mark.slow
+def test_the_page_of_all_results_is_small_and_loads_nothing(tmp_path):
+    for kind in ("tables", "figures"):
+        (tmp_path / kind).symlink_to(SOURCE / "results" / kind)
+    for name in ("claims.csv", "verdicts.csv", "provenance.json"):
+        (tmp_path / name).symlink_to(SOURCE / "results" / name)
+    page = report.write_report(tmp_path).read_text()
+    assert len(page.encode()) < 5_000_000
+    assert not re.search(r'(src|href)="https?://[^"]*\.(js|css|png|webp)"', page)
 
 
 def test_a_figure_without_a_caption_still_shows(text):
