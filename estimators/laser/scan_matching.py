@@ -27,6 +27,7 @@ from estimators.laser.icp import (
     Rules,
     prepare,
     register,
+    split_directions,
 )
 from estimators.laser.remembered import seen_again
 from estimators.laser.scan_lines import without_sparse_lines
@@ -194,13 +195,15 @@ class ScanMatcher:
         mount = laser.mount.pose
         in_laser, _ = guess.in_sensor(mount)
         (xx, _, _), (_, yy, _), (_, _, turn) = in_laser.covariance.tolist()
+        gate_m = min(_LEAST_GATE_M + 4.0 * math.sqrt(max(xx + yy, 0.0)), _MOST_GATE_M)
+        gate_rad = min(_LEAST_GATE_RAD + 4.0 * math.sqrt(max(turn, 0.0)), _MOST_GATE_RAD)
         found = register(
             scan,
             reference,
             in_laser.mean,
             metric=self.believed.metric,
-            gate_m=min(_LEAST_GATE_M + 4.0 * math.sqrt(max(xx + yy, 0.0)), _MOST_GATE_M),
-            gate_rad=min(_LEAST_GATE_RAD + 4.0 * math.sqrt(max(turn, 0.0)), _MOST_GATE_RAD),
+            gate_m=gate_m,
+            gate_rad=gate_rad,
             heading_window_rad=heading_window_rad,
             rules=self.rules,
         )
@@ -212,7 +215,7 @@ class ScanMatcher:
         motion, to_base = Gaussian(found.T_target_source, R).in_sensor(se2.inverse(mount))
         if found.status != "degenerate":
             return Match(motion, found.status, _EVERYTHING, _NOTHING, found.overlap)
-        directions = icp_covariance.split_directions(found)
+        directions = split_directions(found)
         held_in_base, loose_in_base = (to_base @ part for part in directions)
         coordinates = np.linalg.inv(np.hstack([held_in_base, loose_in_base]))
         held, loose = np.split(coordinates, [held_in_base.shape[1]])
