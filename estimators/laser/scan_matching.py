@@ -31,6 +31,7 @@ from estimators.laser.icp import (
 )
 from estimators.laser.remembered import seen_again
 from estimators.laser.scan_lines import without_sparse_lines
+from estimators.laser.sweep import at_stamp
 from sim import se2
 from sim.arrays import Array
 from sim.options import NonNegative, options
@@ -161,9 +162,18 @@ class ScanMatcher:
         """Whether scans are cut into lines and arcs, as the metric that matches them needs it."""
         return self.believed.metric == "point_to_line"
 
-    def prepare(self, ranges_m: ArrayLike, laser: Laser) -> PreparedScan | None:
-        """Prepare a scan of this laser; None if it shows too little to be registered."""
-        scan = prepare(ranges_m, laser.bearings_rad, laser.max_range_m, curves=self.curves)
+    def prepare(
+        self, ranges_m: ArrayLike, laser: Laser, moved: ArrayLike | None = None, in_s: float = 0.0
+    ) -> PreparedScan | None:
+        """Prepare a scan of this laser; None if it shows too little to be registered.
+
+        With `moved`, the motion (3,) of base_link in the time `in_s` before the stamp, the beams of
+        a sweep are taken to the instant of the stamp.
+        """
+        bearings_rad = laser.bearings_rad
+        if moved is not None and getattr(laser, "sweep_s", 0.0) > 0.0:
+            ranges_m, bearings_rad = at_stamp(ranges_m, laser, moved, in_s)
+        scan = prepare(ranges_m, bearings_rad, laser.max_range_m, curves=self.curves)
         if self.curves:  # coarse ranges look free of noise
             scan = scan._replace(noise_m=max(scan.noise_m, self.sigma_m(laser)))
         if self.max_gap_m is not None:
@@ -195,15 +205,13 @@ class ScanMatcher:
         mount = laser.mount.pose
         in_laser, _ = guess.in_sensor(mount)
         (xx, _, _), (_, yy, _), (_, _, turn) = in_laser.covariance.tolist()
-        gate_m = min(_LEAST_GATE_M + 4.0 * math.sqrt(max(xx + yy, 0.0)), _MOST_GATE_M)
-        gate_rad = min(_LEAST_GATE_RAD + 4.0 * math.sqrt(max(turn, 0.0)), _MOST_GATE_RAD)
         found = register(
             scan,
             reference,
             in_laser.mean,
             metric=self.believed.metric,
-            gate_m=gate_m,
-            gate_rad=gate_rad,
+            gate_m=min(_LEAST_GATE_M + 4.0 * math.sqrt(max(xx + yy, 0.0)), _MOST_GATE_M),
+            gate_rad=min(_LEAST_GATE_RAD + 4.0 * math.sqrt(max(turn, 0.0)), _MOST_GATE_RAD),
             heading_window_rad=heading_window_rad,
             rules=self.rules,
         )
