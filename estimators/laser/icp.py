@@ -253,7 +253,7 @@ def register(
     guess = pose.copy()
     found = _judged(pair, metric, pose, window, settings, stages, of_points)
     if found.status == "degenerate" and source.curves:
-        # it has wandered along what nothing holds, and that is no straight way: hold it there
+        # it has wandered along what nothing holds, on a way that bends: hold it there
         settings = settings._replace(pinned=_pinned(found))
         found = _judged(pair, metric, guess, window, settings, stages, of_points)
     return found
