@@ -155,7 +155,10 @@ class GraphSlam(GraphSlamOptions):
         extras: dict[str, Any] = {}
         reading = frame.readings.get(self.laser)
         if reading is not None:
-            status = self._see(self._matcher.prepare(reading["ranges_m"], self._laser))
+            scan = self._matcher.prepare(
+                reading["ranges_m"], self._laser, motion.mean, frame.duration_s
+            )
+            status = self._see(scan)
             extras["registration_status"] = status
             if status not in ("first", "ok", "degenerate"):
                 extras["status"] = status

@@ -132,22 +132,24 @@ class EkfIcp(EkfIcpOptions):
 
     def step(self, frame: Frame) -> Belief:
         """Predict by the wheels; correct by the Frame's scan, if it has one."""
-        self._predict(frame)
+        moved = self._predict(frame)
         extras: dict[str, Any] = {}
         scan = frame.readings.get(self.laser)
         if scan is not None and self._is_due():
-            self._correct(self.matcher.prepare(scan["ranges_m"], self._laser), extras)
+            prepared = self.matcher.prepare(scan["ranges_m"], self._laser, moved, frame.duration_s)
+            self._correct(prepared, extras)
         by_twist = _from_twist(self._mean[_POSE])
         covariance = by_twist @ self._covariance[_POSE, _POSE] @ by_twist.T
         mean = self._mean[_POSE] + self._origin
         return Belief(mean, (covariance + covariance.T) / 2.0, extras)
 
-    def _predict(self, frame: Frame) -> None:
-        """Move the robot's pose by the wheels; the clones stay."""
+    def _predict(self, frame: Frame) -> Array:
+        """Move the robot's pose by the wheels, and return the motion; the clones stay."""
         motion = self._wheels.predict(frame)
         self._mean[_POSE], _, by_motion = compose(self._mean[_POSE], motion.mean)
         by_motion = _from_twist(-self._mean[_POSE]) @ by_motion
         self._covariance[_POSE, _POSE] += by_motion @ motion.covariance @ by_motion.T
+        return motion.mean
 
     def _is_due(self) -> bool:
         """Whether a scan is to be registered, by the motion since the last one that was."""

@@ -30,7 +30,7 @@ from sim.compiled import njit
 from sim.errors import InputError, require
 from sim.options import Count, NonNegative, options
 
-__all__ = ["PreparedScan", "Registration", "Rules", "prepare", "register"]
+__all__ = ["PreparedScan", "Registration", "Rules", "prepare", "register", "split_directions"]
 
 Metric = Literal["point_to_line", "point_to_plane", "point_to_point"]
 Plane = Literal["matched_point", "centroid"]
@@ -48,6 +48,7 @@ MIN_POINTS = 3  # of a scan that can be registered
 MIN_OVERLAP = 0.6  # share of the source's points that must agree with the target
 MIN_OVERLAP_OF_CURVES = 0.4  # of scans cut at jump edges: a turn takes a third out of view
 MIN_AGREEMENT = 0.5  # the same of those, in both scans, that bear on any one direction
+UNKNOWN_M, UNKNOWN_RAD = 10.0, math.pi  # standard deviations of an unconstrained direction
 MIN_INFORMATION_RATIO = 4.0  # times the spurious information that the noise of the lines makes
 
 
@@ -220,7 +221,7 @@ def register(
         gate_rad = _SEARCHED_RAD if window > 0.0 else _GUESSED_RAD
     settings = Settings(
         rules.max_iterations, rules.trim, rules.stop_error_m, _REST_M, _REST_RAD,
-        gate_m / 4.0, gate_rad / 4.0,
+        gate_m / 4.0, gate_rad / 4.0, np.zeros((3, 3)),
     )  # fmt: skip
     width, huber = _WIDTHS[rules.kernel], rules.kernel == "huber"
     reach_m, middle_m = 4.0 * gate_m / gate_rad, 0.5 / _TURN_THEN
@@ -249,12 +250,31 @@ def register(
         source, target, whole_lines, metric != "point_to_point", surface, planes,
         max(source.noise_m, target.noise_m),
     )  # fmt: skip
+    guess = pose.copy()
+    found = _judged(pair, metric, pose, window, settings, stages, of_points)
+    if found.status == "degenerate" and source.curves:
+        # it has wandered along what nothing holds, on a way that bends: hold it there
+        settings = settings._replace(pinned=_pinned(found))
+        found = _judged(pair, metric, guess, window, settings, stages, of_points)
+    return found
+
+
+def _judged(
+    pair: Pair,
+    metric: Metric,
+    pose: Array,
+    window: float,
+    settings: Settings,
+    stages: tuple[Stage, ...],
+    planes: Planes | None,
+) -> Registration:
+    """Register from `pose`, in place, and judge what comes of it."""
     fit, iterations, converged, normal, information, spurious, agreed, denied = _register(
         pair, pose, window, settings, stages
     )
     pose[2] = math.remainder(pose[2], 2.0 * math.pi)
     status = "ok"
-    min_overlap = MIN_OVERLAP_OF_CURVES if source.curves else MIN_OVERLAP
+    min_overlap = MIN_OVERLAP_OF_CURVES if pair.source.curves else MIN_OVERLAP
     if np.count_nonzero(fit.weights) < min_overlap * len(fit.weights):
         status = "poor_overlap"
     elif not _positive_definite(information - MIN_INFORMATION_RATIO * spurious):
@@ -265,8 +285,34 @@ def register(
         status = "not_converged"
     return Registration(
         pose, metric, status, fit.matches, fit.residuals, fit.weights, iterations, converged,
-        normal, information, spurious, of_points,
+        normal, information, spurious, planes,
     )  # fmt: skip
+
+
+def split_directions(registration: Registration) -> tuple[Array, Array]:
+    """Directions of the pose that the scans hold (3, 3 - D), and do not hold (3, D), D = 0 to 3.
+
+    Not held are those in which the information of the target's lines is less than 4 times the
+    spurious part that the noise of their directions adds. A column has length one in units of
+    `UNKNOWN_M` and `UNKNOWN_RAD`; all are orthogonal in the information.
+    """
+    unit = np.array([UNKNOWN_M, UNKNOWN_M, UNKNOWN_RAD])
+    information = registration.information * np.outer(unit, unit)
+    spurious = registration.information_noise * np.outer(unit, unit)
+    least = (1e-12 * np.trace(information) + 1e-300) * np.eye(3)
+    root = np.linalg.inv(np.linalg.cholesky(information + least))
+    share, basis = np.linalg.eigh(root @ (spurious + least) @ root.T)
+    directions = root.T @ basis
+    directions /= np.linalg.norm(directions, axis=0)
+    loose = share > 1.0 / MIN_INFORMATION_RATIO
+    return unit[:, None] * directions[:, ~loose], unit[:, None] * directions[:, loose]
+
+
+def _pinned(found: Registration) -> Array:
+    """Directions that the scans do not hold, as `Settings.pinned`."""
+    held, loose = split_directions(found)
+    rows = UNKNOWN_M * np.linalg.inv(np.hstack([held, loose]))[held.shape[1] :]
+    return np.asarray(rows.T @ rows)
 
 
 def _positive_definite(matrix: Array) -> bool:

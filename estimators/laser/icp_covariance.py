@@ -20,11 +20,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from estimators.laser.icp import (
-    MIN_INFORMATION_RATIO,
+    UNKNOWN_M,
+    UNKNOWN_RAD,
     PreparedScan,
     Registration,
     prepare,
     register,
+    split_directions,
 )
 from estimators.laser.icp_iterations import distance
 from estimators.laser.scan_lines import Segments
@@ -36,7 +38,6 @@ Scans = Literal["both", "last"]
 Matches = Literal["held", "sliding"]
 
 _LEAST_MEMBERS = 3  # points on a line before their mean counts
-UNKNOWN_M, UNKNOWN_RAD = 10.0, math.pi  # standard deviations of an unconstrained direction
 
 
 @njit(error_model="numpy")
@@ -333,25 +334,6 @@ def unscented_censi(
     if registration.status in ("empty", "poor_overlap"):
         return of_noise
     return of_noise + _spread(registration, source, target, initial_covariance, initial, options)
-
-
-def split_directions(registration: Registration) -> tuple[Array, Array]:
-    """Directions of the pose that the scans hold (3, 3 - D), and do not hold (3, D), D = 0 to 3.
-
-    Not held are those in which the information of the target's lines is less than 4 times the
-    spurious part that the noise of their directions adds. A column has length one in units of
-    `UNKNOWN_M` and `UNKNOWN_RAD`; all are orthogonal in the information.
-    """
-    unit = np.array([UNKNOWN_M, UNKNOWN_M, UNKNOWN_RAD])
-    information = registration.information * np.outer(unit, unit)
-    spurious = registration.information_noise * np.outer(unit, unit)
-    least = (1e-12 * np.trace(information) + 1e-300) * np.eye(3)
-    root = np.linalg.inv(np.linalg.cholesky(information + least))
-    share, basis = np.linalg.eigh(root @ (spurious + least) @ root.T)
-    directions = root.T @ basis
-    directions /= np.linalg.norm(directions, axis=0)
-    loose = share > 1.0 / MIN_INFORMATION_RATIO
-    return unit[:, None] * directions[:, ~loose], unit[:, None] * directions[:, loose]
 
 
 def _sandwich(

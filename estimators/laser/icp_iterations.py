@@ -10,6 +10,7 @@ from sim.arrays import Array, Ints
 from sim.compiled import njit
 
 _NO_GAIN = 1e-4  # fall of the cost, in squared standard deviations, that is worth no iteration
+_STIFFNESS = 1e4  # times the information of the scans, of what is pinned
 _GRAZING = 0.001  # squared sine below which a beam along a wall is not trusted further
 
 
@@ -51,6 +52,9 @@ class Settings(NamedTuple):
         Iterations end when both parts of the increment fall below these.
     sigma_m, sigma_rad
         Standard deviations of the guess.
+    pinned
+        (3, 3) sum of c c^T over coordinates c of the pose that stay as guessed, as far as c moves
+        with the pose, 1/m; zeros: none.
     """
 
     max_iterations: int
@@ -60,6 +64,7 @@ class Settings(NamedTuple):
     increment_rad: float
     sigma_m: float
     sigma_rad: float
+    pinned: Array
 
 
 class Stage(NamedTuple):
@@ -354,6 +359,11 @@ def align(
                 hold = (pair.noise_m / sigma) ** 2
                 normal[k, k] += hold
                 gradient[k] += hold * (pose[k] - guess[k])
+        stiffness = _STIFFNESS * (normal[0, 0] + normal[1, 1])
+        for k in range(3):
+            for m in range(3):
+                normal[k, m] += stiffness * settings.pinned[k, m]
+                gradient[k] += stiffness * settings.pinned[k, m] * (pose[m] - guess[m])
         moved, turned, gained = _step(normal, gradient, pose)
         at_rest = moved < stage.slack * settings.increment_m
         at_rest &= turned < stage.slack * settings.increment_rad

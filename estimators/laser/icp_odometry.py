@@ -80,8 +80,8 @@ class IcpOdometry(IcpOdometryOptions):
         reading = frame.readings.get(self.laser)
         if reading is None:
             return _belief(self._last.belief.then(self._rolled), {})
-        scan = self.matcher.prepare(reading["ranges_m"], self._laser)
         guess = self._guess()
+        scan = self.matcher.prepare(reading["ranges_m"], self._laser, guess.mean, self._since_s)
         belief = self._last.belief.then(guess)
         if scan is None:
             return _belief(belief, {"registration_status": "empty", "status": "empty"})

@@ -27,9 +27,11 @@ from estimators.laser.icp import (
     Rules,
     prepare,
     register,
+    split_directions,
 )
 from estimators.laser.remembered import seen_again
 from estimators.laser.scan_lines import without_sparse_lines
+from estimators.laser.sweep import at_stamp
 from sim import se2
 from sim.arrays import Array
 from sim.options import NonNegative, options
@@ -160,9 +162,18 @@ class ScanMatcher:
         """Whether scans are cut into lines and arcs, as the metric that matches them needs it."""
         return self.believed.metric == "point_to_line"
 
-    def prepare(self, ranges_m: ArrayLike, laser: Laser) -> PreparedScan | None:
-        """Prepare a scan of this laser; None if it shows too little to be registered."""
-        scan = prepare(ranges_m, laser.bearings_rad, laser.max_range_m, curves=self.curves)
+    def prepare(
+        self, ranges_m: ArrayLike, laser: Laser, moved: ArrayLike | None = None, in_s: float = 0.0
+    ) -> PreparedScan | None:
+        """Prepare a scan of this laser; None if it shows too little to be registered.
+
+        With `moved`, the motion (3,) of base_link in the time `in_s` before the stamp, the beams of
+        a sweep are taken to the instant of the stamp.
+        """
+        bearings_rad = laser.bearings_rad
+        if moved is not None and getattr(laser, "sweep_s", 0.0) > 0.0:
+            ranges_m, bearings_rad = at_stamp(ranges_m, laser, moved, in_s)
+        scan = prepare(ranges_m, bearings_rad, laser.max_range_m, curves=self.curves)
         if self.curves:  # coarse ranges look free of noise
             scan = scan._replace(noise_m=max(scan.noise_m, self.sigma_m(laser)))
         if self.max_gap_m is not None:
@@ -212,7 +223,7 @@ class ScanMatcher:
         motion, to_base = Gaussian(found.T_target_source, R).in_sensor(se2.inverse(mount))
         if found.status != "degenerate":
             return Match(motion, found.status, _EVERYTHING, _NOTHING, found.overlap)
-        directions = icp_covariance.split_directions(found)
+        directions = split_directions(found)
         held_in_base, loose_in_base = (to_base @ part for part in directions)
         coordinates = np.linalg.inv(np.hstack([held_in_base, loose_in_base]))
         held, loose = np.split(coordinates, [held_in_base.shape[1]])

@@ -18,6 +18,7 @@ from estimators.laser.icp import (
     Rules,
     prepare,
     register,
+    split_directions,
 )
 from experiments.evaluation.scan_bound import cast, fisher_bound
 from sim import se2
@@ -224,7 +225,7 @@ def _nees_share(error: Array, covariance: Array, found: Registration) -> float:
     """NEES over its degrees of freedom, in the directions that the scans constrain."""
     if found.status != "degenerate":
         return float(error @ np.linalg.solve(covariance, error)) / 3.0
-    held, loose = icp_covariance.split_directions(found)
+    held, loose = split_directions(found)
     if held.shape[1] == 0:
         return math.nan
     rows = np.linalg.inv(np.hstack([held, loose]))[: held.shape[1]]

@@ -330,3 +330,46 @@ class Hall(FurnishedOptions):
             functools.partial(_box, plan), clearance_m=1.0,
         )  # fmt: skip
         return self.finish(plan, "hall", rng)
+
+
+@options("world")
+class Polygon(FurnishedOptions):
+    """A building with slanted walls round a court of the same outline; with many sides, round."""
+
+    n_sides: Annotated[int, Field(ge=3, le=1000)] = 7
+    radius_m: Positive = 9.0
+    """Of the corners, on average."""
+    irregular_share: Annotated[float, Field(ge=0.0, le=0.3)] = 0.15
+    """By which a corner may lie farther out or in, and by which part of a side it may be turned."""
+    court_share: Annotated[float, Field(ge=0.0, le=0.5)] = 0.35
+    """Size of the court in the middle; 0: there is none."""
+    n_boxes: NonNegativeInt = 4
+    n_pillars: NonNegativeInt = 3
+
+    def __post_init__(self) -> None:
+        low = 1.0 - self.irregular_share - self.court_share * (1.0 + self.irregular_share)
+        check_margins(radius_m=self.radius_m * low * math.cos(math.pi / self.n_sides) - 1.5)
+
+    def build(self, rng: np.random.Generator) -> World:
+        """Build the world."""
+        plan, share = Plan(), self.irregular_share
+        angles = np.arange(self.n_sides) + rng.uniform(-share, share, self.n_sides)
+        angles *= 2.0 * math.pi / self.n_sides
+        radii = self.radius_m * (1.0 + rng.uniform(-share, share, self.n_sides))
+        outline = radii[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+        plan.enclosure(outline)
+        if self.court_share:
+            plan.prism(self.court_share * outline, 0.0, 2.5, on_object=False)
+        between = (1.0 + self.court_share) / 2.0
+        ring = between * outline[:: max(self.n_sides // 24, 1)]
+        plan.tour = [(float(x), float(y)) for x, y in (*ring, ring[0])]
+        area = outline.min(axis=0), outline.max(axis=0)
+        for count, draw_outline in (
+            (self.n_boxes, lambda own: _turned(own.uniform(0.3, 1.0, 2), own)),
+            (self.n_pillars, lambda own: round_corners((0.0, 0.0), own.uniform(0.12, 0.3))),
+        ):
+            plan.put(
+                rng, area, count, draw_outline, lambda corners, own: plan.prism(corners, 0.0, 2.5),
+                clearance_m=_OFF_TOUR_M,
+            )  # fmt: skip
+        return self.finish(plan, "polygon", rng)

@@ -93,7 +93,7 @@ def aligned(scans, of_planes, start, n):
     pair = icp_iterations.Pair(*scans, False, of_planes is not None, surface, planes_at, 0.01)
     every = icp_iterations.Sample(np.arange(many), np.ones(many))
     plain = icp_iterations.Stage(False, True, math.inf, math.inf, math.inf, 0.0)  # no weights
-    settings = icp_iterations.Settings(n, 0.0, 0.0, 1e-5, 1e-5, 0.0, 0.0)
+    settings = icp_iterations.Settings(n, 0.0, 0.0, 1e-5, 1e-5, 0.0, 0.0, np.zeros((3, 3)))
     fit = icp_iterations.Fit(np.zeros(many, np.int64), np.zeros(many), np.zeros(many))
     pose = start.copy()
     icp_iterations.align(pair, settings, plain, every, start, pose, fit)

@@ -14,9 +14,10 @@ from sim.sensors.rays import ExactRays
 from sim.simulate import Member, record
 from sim.worlds.buildings import Rooms, boxes, office, room
 from sim.worlds.floor_plan import CHORD_ERROR_M, arc_points, gaps_m, round_corners
-from sim.worlds.irregular import Clutter, CorridorsAlike, Curved, Hall
+from sim.worlds.irregular import Clutter, CorridorsAlike, Curved, Hall, Polygon
+from sim.worlds.posts import Orchard, Warehouse
 
-KINDS = (Clutter, Curved, CorridorsAlike, Hall)
+KINDS = (Clutter, Curved, CorridorsAlike, Hall, Polygon, Orchard, Warehouse)
 ROBOT = DifferentialDrive(wheel_radius_m=0.1, track_m=0.38, body_length_m=0.48, body_width_m=0.36)
 
 
