@@ -32,7 +32,7 @@ def run(profile: Profile, out: Results, on_progress: Progress) -> None:
     Parameters
     ----------
     profile
-        `quick`: 4 drives of each method; `full`: 250.
+        `quick`: 4 drives of each method; `full`: 60.
     """
     fewer = [] if profile is Profile.FULL else ["seed=range(1000,1004)"]
     runs = plan_experiments(["study=self_knowledge", *fewer])
