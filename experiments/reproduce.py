@@ -275,7 +275,7 @@ def reproduce_over(study: str, folder: Path) -> None:
     _chosen(study)
     module = _part(study, "study")
     able = [each for each in OWN if hasattr(_part(each, "study"), "over_folder")]
-    require(study in able, f"--logs: {study} runs over no logs; take --paper {' or '.join(able)}")
+    require(study in able, f"{study} runs over no folder of logs; {' or '.join(able)} does")
     if folder.resolve() == DATA.resolve() and not why_missing():
         reproduce_part(study, "logs")
         show(short(results() / "tables" / f"{study}_logs.csv"))

@@ -154,7 +154,10 @@ class Region:
         elif is_one:
             said += [f"{self.called} matters most, without a clear boundary; it {self.boundary}."]
         elif self.boundary not in (NOWHERE, EVERYWHERE):
-            said += [f"No single setting decides; it {self.boundary}."]
+            reverses = LEAST <= self.share.value <= MOST
+            said += [
+                f"No single setting {'decides' if reverses else 'reverses it'}; it {self.boundary}."
+            ]
         if self.boundary in (NOWHERE, EVERYWHERE):
             said += ["Nothing beyond the ranges was tried, so what would change this is not known."]
         if self.failing:

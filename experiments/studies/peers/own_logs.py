@@ -46,7 +46,7 @@ def over_folder(folder: Path, on_progress: Progress) -> dict[str, pd.DataFrame]:
         try:
             kind_of(log)
         except InputError as error:
-            raise InputError(f"{error}; move it out of the folder of --logs") from error
+            raise InputError(f"{error}; move it out of the folder of logs") from error
     return ordered(tables_of(over_own, [(str(log),) for log in found], on_progress))
 
 
@@ -64,7 +64,7 @@ def own_logs(folder: Path) -> list[Path]:
     InputError
         If it is not a folder, or holds none.
     """
-    require(folder.is_dir(), f"--logs {folder}: not a folder; name one that holds logs")
+    require(folder.is_dir(), f"{folder}: not a folder; name one that holds logs")
     found = [
         path
         for path in sorted(folder.iterdir())
@@ -72,7 +72,7 @@ def own_logs(folder: Path) -> list[Path]:
     ]
     require(
         bool(found),
-        f"--logs {folder}: holds no logs; put logs there (docs/formats.md), and beside LOG.npz "
+        f"{folder}: holds no logs; put logs there (docs/formats.md), and beside LOG.npz "
         "LOG.relations or LOG.tum to judge by",
     )
     return found
@@ -140,7 +140,7 @@ def _by_poses(name: str, logged: Recording, found: Calibration) -> Case:
     first = calibrated.truth_at(calibrated.frame_stamps[:1])[0]
     require(
         bool(np.isfinite(first).all()),
-        "its reference begins after its first Frame; cut it with `estima convert --from`",
+        "its reference begins after its first Frame; cut the log there with `estima convert`",
     )
     start = known_start(calibrated, se2.compose(first, se2.inverse(moved)))
     return Case(name, calibrated, found, start, POSES, moved)

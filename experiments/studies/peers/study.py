@@ -58,7 +58,7 @@ def run(profile: Profile, out: Results, on_progress: Progress) -> None:
 def over_logs(_profile: Profile, on_progress: Progress) -> dict[str, pd.DataFrame]:
     """The table of all methods over the logs of others."""
     if why := why_missing():
-        raise InputError(f"{why}; put them there, or name a folder of logs with --logs")
+        raise InputError(f"{why}; put them there, or name another folder of logs")
     by_edges = [(name,) for name in edges.LOGS]
     by_wheels = [(name,) for name in LOGS]
     share = len(by_edges) / len(by_edges + by_wheels)

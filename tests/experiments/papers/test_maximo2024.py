@@ -214,7 +214,7 @@ def test_our_own_claims_follow_their_tables():
     )
     assert [c.verdict for c in claims.mx8(trials)] == ["reproduced", "reproduced"]
     found = concluded("maximo2024", claims.mx8(trials))
-    assert "at least 100 % of simulated kidnapped robots are found again" in found.sentence
+    assert "100.0 % or more of simulated kidnapped robots are found again" in found.sentence
     quick = trials.assign(settled_at=4.0)  # found again even without injection
     assert [c.verdict for c in claims.mx8(quick)] == ["not_reproduced", "reproduced"]
     slow = trials.assign(settled_at=25.0)

@@ -160,7 +160,7 @@ def test_a_bad_folder_or_log_is_one_line_with_its_remedy(tmp_path, folder):
     (folder / "room.relations").unlink()
     with pytest.raises(InputError, match=r"room.npz: .*put room.relations or room.tum beside it"):
         own_logs.own_case(folder / "room.npz")
-    with pytest.raises(InputError, match="mcl_office runs over no logs; take --paper peers"):
+    with pytest.raises(InputError, match="mcl_office runs over no folder of logs; peers does"):
         reproduce.reproduce_over("mcl_office", folder)
 
 
