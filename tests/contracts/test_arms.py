@@ -206,7 +206,8 @@ def test_planes_and_points_have_the_same_stages_and_end(monkeypatch):
     asked = []
 
     def aligned(pair, pose, window, settings, stages):
-        asked.append((pair.whole_lines, pose.copy(), window, settings, stages))
+        pinned = settings.pinned.tolist()
+        asked.append((pair.whole_lines, pose.copy(), window, settings[:-1], pinned, stages))
         return found(pair, pose, window, settings, stages)
 
     found = icp._register

@@ -54,7 +54,7 @@ class _Perfect:
         self.R, self.share, self.apparent, self.seen = np.array(R), share, {}, {}
         self.rng, self.poses, self.now = np.random.default_rng(0), None, -1
 
-    def prepare(self, ranges_m, laser):
+    def prepare(self, ranges_m, laser, moved, in_s):
         self.now += 1
         own = self.rng.multivariate_normal(np.zeros(3), self.share / 2 * self.R)
         scan = np.full(9, self.now)  # anything with a length and a name

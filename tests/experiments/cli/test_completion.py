@@ -38,7 +38,7 @@ def complete(line, **environment):
 @pytest.mark.parametrize(
     ("line", "offered"),
     [
-        ("estima run world=o", {"world=office"}),
+        ("estima run world=o", {"world=office", "world=orchard"}),
         (
             "estima run world=office estimator=ekf_i",
             {"estimator=ekf_icp", "estimator=ekf_icp_paper", "estimator=ekf_icp_tuned"},
