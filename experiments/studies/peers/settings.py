@@ -27,7 +27,7 @@ READS = {
 # Real logs: robots of MRCLAM on which no option was chosen; starts in Wean Hall's map (m, m, rad),
 # as real_logs finds them in cells of 0.2 m and steps of 4 degrees, and how far they may be off
 MRCLAM_ROBOTS = (3, 4, 5)
-WEAN_STARTS = {1: (40.3, 41.3, -1.60570291183), 2: (46.1, 40.7, -1.67551608191)}
+WEAN_STARTS = {1: (40.7, 41.3, -1.60570291183), 2: (46.1, 40.7, -1.67551608191)}
 WEAN_SIGMAS = (0.2, 0.2, 0.05)
 TOO_DEAR = ("mrpt_rbpf",)  # a grid a particle: as much time as all other methods of other projects
 CAP_M = 1.0  # of a beam's distance from the nearest wall
