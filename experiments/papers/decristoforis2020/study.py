@@ -148,7 +148,19 @@ def _region(name: str, profile: Profile, on_progress: Progress) -> Mapping[str, 
     return tables_of(operator.call, jobs, on_progress)
 
 
-PARTS = {"closed_form": _closed_form} | {
+def _wrong_beliefs(profile: Profile) -> list[Call]:
+    """Drives of filters that are told another slip or noise than the true one."""
+    full, first = profile is Profile.FULL, FIRST_SEED[profile]
+    short = [] if full else ["route.distance_m=8.0"]
+    seeds = range(first, first + (N_GEOMETRIES if full else 4) // 4)
+    return [(_scored, "beliefs", _BELIEF, group) for group in _planned("beliefs", seeds, *short)]
+
+
+def _beliefs(profile: Profile, on_progress: Progress) -> Mapping[str, pd.DataFrame]:
+    return tables_of(operator.call, _wrong_beliefs(profile), on_progress)
+
+
+PARTS = {"beliefs": _beliefs, "closed_form": _closed_form} | {
     f"region_{name}": partial(_region, name) for name in ("DC1", "DC2", "DC4")
 }
 
@@ -232,10 +244,7 @@ def _jobs(profile: Profile, out: Results) -> list[Job]:
                 *_planned("methods", fewer, *at, *ten_hz, *engine),
             )
         ),
-        *(
-            (slow, _scored, ["beliefs", _BELIEF, group])
-            for group in _planned("beliefs", range(first, first + n // 4), *short)
-        ),
+        *((slow, function, given) for function, *given in _wrong_beliefs(profile)),
         *((0.5 * slow, _scored, ["process_noise", _ADJUSTED, group]) for group in adjusted),
         (0.2, _drawn_corridor, [corridor, out]),
         *(
