@@ -43,6 +43,11 @@ _REVISITED = 0.7  # share of the thresholds of key frames within which one is ta
 _SEEN_AGAIN = 0.5  # share of a scan that a remembered key frame should see as well
 _MOST_WEAKENED = 150.0  # times its variance that the innovation of one may have
 _REVISIT_M = 0.5  # standard deviation of where it is; at more, graph_slam has to close the loop
+# Slip that the wheels' noise does not describe
+_AGREES = 1e-3  # share of registrations of a scan that differ more if they err as believed
+_RELEARNT = 0.1  # weight of a scan in how much the wheels are believed to slip
+_MOST_SURPRISED = 4.0  # times the usual innovation that one scan may teach of it
+_NEGLIGIBLE_M2 = 1e-10
 
 
 @options("estimator")
@@ -57,10 +62,6 @@ class EkfIcpOptions(EncoderTickOptions, KeyFrameOptions, Rules, MatcherOptions):
     gate_probability: Probability | None = 1e-9
     """Reject a registration if only this share of all should have a larger innovation; null: use
     all. The default rejects only what must be a wrong match."""
-    slip_burst_m: NonNegative = 0.0
-    """What a wheel may slip at once, as a standard deviation, m: then a registration outside the
-    gate that did not fail is explained by slip since the last scan, which neither kr nor kl
-    describes. 0: it is left out."""
     keyframe_distance_m: NonNegative = 1.0
     keyframe_turn_rad: NonNegative = 0.7
     remembered: Annotated[int, Field(ge=0, le=1000)] = 100
@@ -76,11 +77,6 @@ class EkfIcpOptions(EncoderTickOptions, KeyFrameOptions, Rules, MatcherOptions):
             (self.register_distance_m > 0.0) == (self.register_turn_rad > 0.0),
             "estimator.register_distance_m and register_turn_rad go together, since a scan is "
             "registered once either is exceeded: set both, or neither",
-        )
-        require(
-            not self.slip_burst_m or self.gate_probability is not None,
-            "estimator.slip_burst_m is for registrations outside the gate; "
-            "set estimator.gate_probability",
         )
 
 
@@ -127,6 +123,9 @@ class EkfIcp(EkfIcpOptions):
         self._covariance = np.tile(to_twist @ start.covariance @ to_twist.T, (3, 3))
         self._old = RememberedPoses(9)
         self._failures = 0
+        # a scan whose pose in the key frame was registered, and the key frame's pose in it
+        self._witness: tuple[PreparedScan, Gaussian] | None = None
+        self._slip_m2 = 0.0  # variance of a wheel's slip from scan to scan besides kr and kl
         share = self.gate_probability
         self._gates = [math.inf if share is None else chdtri(d, share) for d in range(4)]
 
@@ -167,8 +166,9 @@ class EkfIcp(EkfIcpOptions):
             extras["registration_status"] = "first"
             self._insert(self._own_noise(scan))
             return self._keep(scan, scan, (_NEW, _NEW))
+        if self._slip_m2:
+            self._slip(self._slip_m2)
         references = [(_KEY, self._key), (_LAST, self._last)]
-        outside: tuple[Match, slice, PreparedScan] | None = None
         for place, reference in references[: 1 if self._last is self._key else 2]:
             expected, _ = self._expected(place)
             match = self.matcher.match(scan, reference, expected, self._laser, self._rng)
@@ -177,17 +177,18 @@ class EkfIcp(EkfIcpOptions):
                 continue
             if place is _KEY:
                 match = self._as_before(match)
-            if self._take_in(match, place, extras):
+            taken = self._take_in(match, place, extras)
+            if not taken and place is _KEY and self._witnessed(scan, match, expected):
+                taken = self._take_in_as_slip(match, expected, place, extras)
+            if taken:
                 return self._go_on(scan, match, place, reference, extras)
             extras["registration_status"] = "gated"
-            outside = match, place, reference
-        if outside is not None and self._take_in_after_burst(*outside[:2], extras):
-            extras["registration_status"] = outside[0].status
-            return self._go_on(scan, *outside, extras)
         extras["status"] = extras["registration_status"]
         self._insert(self._own_noise(scan))
         self._failures += 1
         lost = self._failures >= _PATIENCE
+        if lost:
+            self._witness = None
         return self._keep(scan if lost else self._key, scan, (_NEW if lost else _KEY, _NEW))
 
     def _go_on(
@@ -200,17 +201,25 @@ class EkfIcp(EkfIcpOptions):
     ) -> None:
         """Keep the reference as key frame, or take up another, or the registered scan."""
         self._failures = 0
-        key, source = reference, place
-        if self.left_key_frame(match.motion.mean):
-            key, source = self._revisit(scan, extras) or (scan, _NEW)
+        self._relearn_slip(extras["nis"], extras["nis_dof"])
+        if not self.left_key_frame(match.motion.mean):
+            self._witness = scan, _inverse(match.motion)
+            return self._keep(reference, scan, (place, _NEW))
+        revisited = self._revisit(scan, extras)
+        if revisited is None:
+            self._witness = reference, match.motion
+            return self._keep(scan, scan, (_NEW, _NEW))
+        key, source, motion = revisited
+        self._witness = scan, _inverse(motion)
         self._keep(key, scan, (source, _NEW))
 
     def _revisit(
         self, scan: PreparedScan, extras: dict[str, Any]
-    ) -> tuple[PreparedScan, slice] | None:
+    ) -> tuple[PreparedScan, slice, Gaussian] | None:
         """Register a scan, which is in the state, with a remembered key frame that it sees again.
 
-        Returns that key frame if it is near enough to be the reference.
+        Returns that key frame, with its place and the scan's pose in it, if it is near enough to be
+        the reference.
         """
         self._expand()
         apart = se2.between(self._mean[12:].reshape(-1, 3), self._mean[_POSE])
@@ -238,7 +247,7 @@ class EkfIcp(EkfIcpOptions):
         far_m, far_rad = self.keyframe_distance_m, self.keyframe_turn_rad
         if exceeds(apart[best], _REVISITED * far_m, _REVISITED * far_rad):
             return None
-        return reference, place
+        return reference, place, match.motion
 
     def _expected(self, place: slice, pose: slice = _POSE) -> tuple[Gaussian, Array]:
         """Pose relative to a clone's, with its covariance; its derivative (3, 3) by the twists.
@@ -299,20 +308,54 @@ class EkfIcp(EkfIcpOptions):
         self._mean = se2.compose(se2.exp(twists), self._mean.reshape(-1, 3)).ravel()
         return True
 
-    def _take_in_after_burst(self, match: Match, place: slice, extras: dict[str, Any]) -> bool:
-        """Take a registration in as `_take_in` does, if the wheels slipped since the last scan."""
-        if not self.slip_burst_m or match.status != "ok":
+    def _witnessed(self, scan: PreparedScan, match: Match, guess: Gaussian) -> bool:
+        """Whether another scan sees this one where its registration with the key frame does.
+
+        Both start from the wheels' guess (of T_key_scan), so if they agree, the wheels are wrong.
+        """
+        if self._witness is None:
             return False
-        turn_rad = 2.0 * self.slip_burst_m / self._wheels.track_m
-        burst = np.diag(np.square([self.slip_burst_m, self.slip_burst_m, turn_rad]))
-        to_twist, before = _from_twist(-self._mean[_POSE]), self._covariance
-        self._covariance = before.copy()
-        self._covariance[_POSE, _POSE] += to_twist @ burst @ to_twist.T
+        other, T_other_key = self._witness
+        second = self.matcher.match(scan, other, T_other_key.then(guess), self._laser, self._rng)
+        if second.failed or not len(second.held):
+            return False
+        first = T_other_key.then(match.motion)
+        off = second.motion.mean - first.mean
+        off[2] = wrap(off[2])
+        off = second.held @ off
+        S = second.held @ (first.covariance + second.motion.covariance) @ second.held.T
+        return float(off @ np.linalg.solve(S, off)) < chdtri(len(off), _AGREES)
+
+    def _take_in_as_slip(
+        self, match: Match, expected: Gaussian, place: slice, extras: dict[str, Any]
+    ) -> bool:
+        """Take a registration in as `_take_in` does, its innovation explained by the wheels."""
+        off = match.motion.mean - expected.mean
+        slip_m = math.hypot(*off[:2]) + self._wheels.track_m / 2.0 * abs(wrap(off[2]))
+        before = self._covariance
+        self._slip(slip_m**2)
         if taken := self._take_in(match, place, extras):
+            self._slip_m2 = max(self._slip_m2, slip_m**2)
             extras["slip_burst"] = True
         else:
             self._covariance = before
         return taken
+
+    def _slip(self, slip_m2: float) -> None:
+        """Widen the robot's pose by slip of the wheels, of this variance."""
+        per_m = 2.0 / self._wheels.track_m
+        to_twist = _from_twist(-self._mean[_POSE])
+        self._covariance = self._covariance.copy()
+        spread = np.diag([slip_m2, slip_m2, per_m**2 * slip_m2])
+        self._covariance[_POSE, _POSE] += to_twist @ spread @ to_twist.T
+
+    def _relearn_slip(self, nis: float, dof: int) -> None:
+        """Follow how far registrations lie off what the wheels foretell."""
+        if self._slip_m2 and dof:
+            surprise = min(nis / dof, _MOST_SURPRISED)
+            self._slip_m2 *= 1.0 + _RELEARNT * (surprise - 1.0)
+            if self._slip_m2 < _NEGLIGIBLE_M2:
+                self._slip_m2 = 0.0
 
     def _as_before(self, match: Match) -> Match:
         """Give a degenerate match the directions of the key frame's first such match.
@@ -380,10 +423,7 @@ def _from_twist(pose: Array) -> Array:
     return np.array([[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]])
 
 
-def _moved(pose: Array, twist: Array) -> Array:
-    """Pose (3,) after a twist in map: exp(twist) * pose."""
-    u, v, turn = twist.tolist()
-    half = turn / 2.0
-    sinc = 1.0 - half * half / 6.0 if abs(half) < 1e-4 else math.sin(half) / half
-    cos, sin = sinc * math.cos(half), sinc * math.sin(half)
-    return compose(np.array([cos * u - sin * v, sin * u + cos * v, turn]), pose)[0]
+def _inverse(motion: Gaussian) -> Gaussian:
+    """The motion back."""
+    mean, by_motion, _ = between(motion.mean, np.zeros(3))
+    return Gaussian(mean, by_motion @ motion.covariance @ by_motion.T)
