@@ -335,7 +335,7 @@ class EkfIcp(EkfIcpOptions):
         before = self._covariance
         self._slip(slip_m**2)
         if taken := self._take_in(match, place, extras):
-            self._slip_m2 = max(self._slip_m2, slip_m**2)
+            self._slip_m2 += _RELEARNT * max(slip_m**2 - self._slip_m2, 0.0)
             extras["slip_burst"] = True
         else:
             self._covariance = before
