@@ -96,6 +96,11 @@ class EkfIcp(EkfIcpOptions):
     scans in a row the newest becomes the key frame. Directions that the scans do not constrain
     are left to the wheels.
 
+    Where only the gate stands against a registration with the key frame, a second scan decides
+    (the last one that was registered, or after a change of key frame the old one). If its
+    registration agrees, the wheels are taken to have slipped by what kr and kl do not describe,
+    and go on being believed less until registrations are foretold again.
+
     Belief extras: `registration_covariance` (3, 3) of T_reference_base, `registration_status`,
     `nis` (normalised innovation squared) with `nis_dof`, `slip_burst` if one was assumed, and
     `status` if a scan was not used.

@@ -7,7 +7,7 @@ import pytest
 
 from estimators.base import Prior
 from estimators.gaussian import STILL, Gaussian
-from estimators.laser.ekf_icp import _KEY, _NEW, _POSE, EkfIcp, _from_twist, _moved
+from estimators.laser.ekf_icp import _KEY, _NEW, _POSE, EkfIcp, _from_twist, _inverse
 from estimators.laser.scan_matching import Match
 from estimators.odometry import Odometry
 from experiments.evaluation.scan_bound import cast
@@ -134,6 +134,10 @@ def test_wheels_that_know_nothing_leave_the_last_registration(share):
     np.testing.assert_allclose(np.diag(belief.covariance), np.diag(R), rtol=0.05)
 
 
+def moved(pose, twist):
+    return se2.compose(se2.exp(twist), pose)
+
+
 def test_derivatives_of_the_measurement():
     estimator = EkfIcp()
     estimator.reset(prior(), np.random.default_rng(0))
@@ -143,22 +147,23 @@ def test_derivatives_of_the_measurement():
     np.testing.assert_allclose(expected.mean, se2.between(key, pose), atol=1e-12)
     for i in range(3):
         twist = 1e-6 * np.eye(3)[i]
-        off = se2.between(key, _moved(pose, twist)) - se2.between(key, _moved(pose, -twist))
+        off = se2.between(key, moved(pose, twist)) - se2.between(key, moved(pose, -twist))
         np.testing.assert_allclose(off / 2e-6, by_twist[:, i], atol=1e-8)
-        off = se2.between(_moved(key, twist), pose) - se2.between(_moved(key, -twist), pose)
+        off = se2.between(moved(key, twist), pose) - se2.between(moved(key, -twist), pose)
         np.testing.assert_allclose(off / 2e-6, -by_twist[:, i], atol=1e-8)
 
 
-def test_twists_move_poses_by_their_exponential():
+def test_derivative_by_a_twist_and_the_motion_back():
     rng = np.random.default_rng(0)
-    for twist in (*rng.standard_normal((5, 3)), np.array([0.3, -0.2, 1e-6])):
-        pose = rng.standard_normal(3)
-        np.testing.assert_allclose(
-            _moved(pose, twist), se2.compose(se2.exp(twist), pose), atol=1e-12
-        )
-        step = 1e-6 * np.eye(3)
-        slopes = [(_moved(pose, d) - _moved(pose, -d)) / 2e-6 for d in step]
+    for pose in rng.standard_normal((5, 3)):
+        slopes = [(moved(pose, d) - moved(pose, -d)) / 2e-6 for d in 1e-6 * np.eye(3)]
         np.testing.assert_allclose(np.array(slopes).T, _from_twist(pose), atol=1e-8)
+        there = Gaussian(pose, np.diag([1e-4, 4e-4, 1e-4]))
+        back = _inverse(_inverse(there))
+        np.testing.assert_allclose(back.mean, pose, atol=1e-12)
+        np.testing.assert_allclose(back.covariance, there.covariance, atol=1e-15)
+        drawn = se2.inverse(rng.multivariate_normal(there.mean, there.covariance, 20_000))
+        np.testing.assert_allclose(np.cov(drawn.T), _inverse(there).covariance, atol=3e-5)
 
 
 def test_an_unsure_heading_learns_nothing_from_relative_poses():
@@ -240,21 +245,39 @@ def test_what_the_scans_do_not_hold_is_left_to_the_wheels(world):
     assert np.all(off < 4.0 * np.sqrt(np.diag(fused)))
 
 
-def test_gate_leaves_out_what_cannot_be():
+class Torn(EkfIcp):
+    """The filter with a witness that says something else than the key frame."""
+
+    def _witnessed(self, scan, match, guess):
+        other, T_other_key = self._witness
+        wrong = Gaussian(T_other_key.mean + [0.05, 0.0, 0.0], T_other_key.covariance)
+        self._witness = other, wrong
+        return super()._witnessed(scan, match, guess)
+
+
+def test_gate_leaves_out_what_two_scans_do_not_agree_on():
     poses, frames = drive(ROOM, 12)
     # the room is moved under the robot: the wheels know better
     shifted = ROOM + np.array([0.1, 0.0, 0.1, 0.0])
     seen = cast(shifted, se2.compose(poses[6], LASER.mount.pose), LASER.bearings_rad)[0]
     frames[6] = with_scan(frames[6], seen)
-    gated = follow(EkfIcp(kr=1e-5, kl=1e-5, gate_probability=1e-3), frames)
-    free = follow(EkfIcp(kr=1e-5, kl=1e-5, gate_probability=None), frames)
+    believed = {"kr": 1e-5, "kl": 1e-5}
+    gated = follow(Torn(**believed, gate_probability=1e-3), frames)
+    free = follow(EkfIcp(**believed, gate_probability=None), frames)
+    agreed = follow(EkfIcp(**believed, gate_probability=1e-3), frames)
     assert gated[6].extras["status"] == "gated"
     assert "status" not in free[6].extras
     assert free[6].extras["nis"] > 16.3
-    assert (
-        np.abs(errors(gated, poses)[6, :2]).max() < 0.5 * np.abs(errors(free, poses)[6, :2]).max()
-    )
+    off_m = {
+        name: np.abs(errors(beliefs, poses)[6, :2]).max()
+        for name, beliefs in (("gated", gated), ("free", free), ("agreed", agreed))
+    }
+    assert off_m["gated"] < 0.5 * off_m["free"]
     assert {b.extras["registration_status"] for b in gated[8:]} == {"ok"}
+    # to two scans it looks as if the wheels had slipped, there and back
+    assert [b.extras.get("slip_burst") for b in agreed[5:9]] == [None, True, None, None]
+    assert off_m["agreed"] == pytest.approx(0.1, abs=0.02)
+    assert np.abs(errors(agreed, poses)[8:, :2]).max() < 0.01
 
 
 def test_ticks_and_sideways_slip_widen():
@@ -271,8 +294,6 @@ def test_wrong_values_are_named():
     for key in ("register_distance_m", "register_turn_rad"):
         with pytest.raises(InputError, match="set both, or neither"):
             EkfIcp(**{key: 0.05})
-    with pytest.raises(InputError, match="gate_probability"):
-        EkfIcp(slip_burst_m=0.1, gate_probability=None)
     with pytest.raises(InputError, match="laser"):
         EkfIcp().reset(prior(laser=None), np.random.default_rng(0))
     assert STILL.covariance.sum() == 0.0  # nobody has written into the shared one
