@@ -329,7 +329,7 @@ class EkfIcp(EkfIcpOptions):
         off[2] = wrap(off[2])
         off = second.held @ off
         S = second.held @ (first.covariance + second.motion.covariance) @ second.held.T
-        return float(off @ np.linalg.solve(S, off)) < chdtri(len(off), _AGREES)
+        return bool(off @ np.linalg.solve(S, off) < chdtri(len(off), _AGREES))
 
     def _take_in_as_slip(
         self, match: Match, expected: Gaussian, place: slice, extras: dict[str, Any]

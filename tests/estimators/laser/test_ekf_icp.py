@@ -250,7 +250,7 @@ class Torn(EkfIcp):
 
     def _witnessed(self, scan, match, guess):
         other, T_other_key = self._witness
-        wrong = Gaussian(T_other_key.mean + [0.05, 0.0, 0.0], T_other_key.covariance)
+        wrong = Gaussian(np.add(T_other_key.mean, [0.05, 0.0, 0.0]), T_other_key.covariance)
         self._witness = other, wrong
         return super()._witnessed(scan, match, guess)
 
