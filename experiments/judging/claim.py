@@ -252,7 +252,9 @@ def waiting(claim: str) -> Claim:
     return shown(Subject(claim, WAITS), said, Interval(math.nan, math.nan, math.nan))
 
 
-def own_design(claim: str, design: str, hits: ArrayLike) -> Claim:
+def own_design(
+    claim: str, design: str, hits: ArrayLike, *, whose: str = "The paper's own design"
+) -> Claim:
     """State how often the paper's own design shows what the paper says.
 
     Parameters
@@ -261,12 +263,14 @@ def own_design(claim: str, design: str, hits: ArrayLike) -> Claim:
         In words, such as "one drive".
     hits
         Whether each recording alone shows it (N,).
+    whose
+        In words, where the paper has no such study.
     """
     shows = np.asarray(hits, bool)
     share = share_interval(int(shows.sum()), len(shows))
     said = (
-        f"The paper's own design, {design}, shows what it says in {int(shows.sum())} of "
-        f"{len(shows)} repetitions."
+        f"{whose}, {design}, shows what is claimed in {int(shows.sum())} of {len(shows)} "
+        "repetitions."
     )
     about = Subject(claim, OWN_DESIGN, arm=design)
     return shown(about, f"share of cases in which {design} shows it", share, said)

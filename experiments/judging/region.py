@@ -150,7 +150,10 @@ class Region:
         ]
         is_one = self.decided_by != NONE_ALONE
         if self.along:
-            said += [f"{self.along}.", f"With the others in the middle, it {self.boundary}."]
+            said += [
+                f"{self.along}.",
+                f"With the others in the middle of their ranges, it {self.boundary}.",
+            ]
         elif is_one:
             said += [f"{self.called} matters most, without a clear boundary; it {self.boundary}."]
         elif self.boundary not in (NOWHERE, EVERYWHERE):
@@ -161,7 +164,10 @@ class Region:
         if self.boundary in (NOWHERE, EVERYWHERE):
             said += ["Nothing beyond the ranges was tried, so what would change this is not known."]
         if self.failing:
-            said += [f"Where it does not hold, {self.failing}."]
+            said += [
+                "Where it does not hold, the headline that misses its limit by most is "
+                f"{self.failing}."
+            ]
         said += [
             f"The interval of this share contains {100 * limit:.0f} %, the limit between {what}, "
             "so the claim is undecided."
@@ -335,8 +341,8 @@ def failing_in_words(fitted: Fitted, headlines: Sequence[str]) -> str:
     count = np.bincount(failing.argmin(axis=0), minlength=len(headlines))
     most = int(count.argmax())
     part = count[most] / count.sum()
-    mostly = "" if part == 1.0 else f", in {_percent(part)} % of it"
-    return f'"{headlines[most]}" misses its limit by most{mostly}'
+    mostly = " (in all of that part)" if part == 1.0 else f" (in {_percent(part)} % of that part)"
+    return f'"{headlines[most]}"{mostly}'
 
 
 def describe(fitted: Fitted, anchor: Anchor | None, headlines: Sequence[str] = ()) -> Region:

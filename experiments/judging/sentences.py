@@ -103,11 +103,16 @@ def power_stated(rows: Sequence[Claim]) -> str:
     if not known:
         return ""
     least = min(known, key=lambda row: row.power)
-    what = f"decide {least.effect}, if there is one"
-    if least.effect == EQUIVALENCE:
-        what = "show that two arms are alike, if they are"
     often = f"{100.0 * min(least.power, 0.99):.0f} of 100"
-    return f" Of studies of this size, {often} would {what}."
+    what = f"{least.effect}, if there is one, would be decided in {often}"
+    if least.effect == EQUIVALENCE:
+        what = f"two arms that are alike would be shown to be so in {often}"
+    found = ", ".join(plain(each, 3) for each in (least.found.low, least.found.high))
+    return (
+        f" Undecided is “{least.statistic}”, {plain(least.found, 3)} [{found}], as the interval "
+        f"contains the limit ({least.criterion}); more data would decide it. With data of this "
+        f"size, {what} studies."
+    )
 
 
 def plain(number: float | Interval, digits: int = 2) -> str:

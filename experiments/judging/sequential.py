@@ -114,7 +114,8 @@ def judge_ratio(
     if len(limits) == 1:
         near = limits[0] / (1.0 + design.effect), limits[0] * (1.0 + design.effect)
         verdict, is_near = judge_one_side(found, *band, near)
-        reason = f"within {100.0 * design.effect:.3g} % of it" if is_near else ""
+        smallest = f"{100.0 * design.effect:.3g} %, its smallest effect of interest"
+        reason = f"within {smallest}" if is_near else ""
     look, cap = int(np.searchsorted(design.looks, len(logs), side="right")), design.looks[-1]
     is_open = verdict is Verdict.UNDECIDED and len(logs) < cap
     words = " and ".join(

@@ -16,6 +16,7 @@ from PIL import Image, UnidentifiedImageError
 from experiments.judging.claim import Role, Verdict, headline_verdict
 from experiments.judging.claims_file import read_claims, read_provenance, read_verdicts, this_code
 from experiments.judging.folders import code_folder, findings
+from experiments.judging.free_settings import FreeSettings, as_words, free_settings
 from experiments.judging.results import Profile, reproduce_command
 from experiments.report.export import as_text, fold_intervals, numeric_columns, plain
 from experiments.report.leaderboard import by_world, on_lasers
@@ -126,14 +127,17 @@ def judged_claims(
 
     Each has what the paper `says`, and whether that is our `own`; its `statistics`, the rows of the
     table, headlines first; its `ruling`, the verdict that follows from the headlines and from the
-    region of free settings if it has one, also in words (`verdict`) with a `style`; and the
-    `sentence` on what came out.
+    region of free settings if it has one, also in words (`verdict`) with a `style`; the
+    `sentence` on what came out; and its free `settings`.
     """
     sentences = verdicts["sentence"].to_dict()
     decided = verdicts.loc[verdicts["region_share"].notna(), "verdict"]
     by_region = {key: Verdict(text) for key, text in decided.items()}
     says = {key: text for page in about.values() for key, text in page["claims"].items()}
     own = {key for page in about.values() for key in page["own"]}
+    open_settings = {
+        key: settings_of(each) for name in about for key, each in free_settings(name).items()
+    }
     rows: dict[str, list[Entry]] = {key: [] for key in says}
     ordered = table.sort_values(["id", "role"], ascending=[True, False], kind="stable")
     for row in ordered.to_dict("records"):
@@ -147,10 +151,25 @@ def judged_claims(
             "sentence": sentences.get(key, ""),
             "paper": statistics[0]["paper"] if statistics else "",
             "statistics": statistics,
+            "settings": open_settings.get(key, []),
             **verdict_on(statistics, by_region.get(key)),
         }
         for key, statistics in rows.items()
     }
+
+
+def settings_of(free: FreeSettings) -> list[Entry]:
+    """Each free setting in words: its name, range, value at the anchor, and the range's source."""
+    return [
+        {
+            "words": each.called,
+            "range": ", ".join(map(as_words, each.choices))
+            or " to ".join(map(as_words, (each.low, each.high))),
+            "anchor": free.anchor.of(each.name) if free.anchor else "",
+            "source": each.source,
+        }
+        for each in free.settings
+    ]
 
 
 def verdict_on(statistics: Sequence[Entry], by_region: Verdict | None = None) -> Entry:

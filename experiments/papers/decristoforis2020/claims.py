@@ -2,6 +2,7 @@
 
 import itertools
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -32,6 +33,7 @@ _BESIDE = (
     ("icp", "odometry"), ("fusion", "icp_guess"), ("icp_guess", "icp"), ("fusion_clone", "icp"),
     ("fusion_clone", "fusion"),
 )  # fmt: skip
+_FAR_TURN_DEG = 45.0  # of the ellipse: turns lie far below or far above
 _HOW = {  # of the ellipses
     "printed": "",
     "lines": ", lines and both scans",
@@ -161,7 +163,11 @@ def dc3(ellipses: pd.DataFrame, design: Design | None = None) -> list[Claim]:
         turned = mean_interval(table[f"turned_in_{bend}_deg"])
         about = Subject("DC3", "turn", method=method, place=bend)
         claim = judge_bounds(about, f"turn of the long axis in {what}, deg", turned, 10.0)
-        claims.append(beside(claim, is_beside))
+        by_world = table[f"turned_in_{bend}_deg"].to_numpy()
+        far = by_world[by_world > _FAR_TURN_DEG]
+        near = by_world[by_world <= _FAR_TURN_DEG]
+        facts = {"n": len(by_world), "far": far.tolist(), "near": near.tolist()}
+        claims.append(beside(replace(claim, facts={**claim.facts, **facts}), is_beside))
         about = Subject("DC3", "median", method=method, place=bend)
         typical = log_ratio_interval(median, before)
         claims.append(shown(about, f"median long axis in {what} over before", typical))
@@ -300,7 +306,10 @@ def dc6(runs: pd.DataFrame, design: Design | None = None) -> list[Claim]:
     claims = [
         beside(_order("DC6", name, table, column, pair, design), name != what or pair not in _ORDER)
         for pair in (*_ORDER, *_BESIDE)
-        for name, column in ((what, "map_distance_m"), ("exp of map entropy", "sharpness"))
+        for name, column in (
+            (what, "map_distance_m"),
+            ("exponential of the map's entropy (its blur)", "sharpness"),
+        )
     ]
     own = table[table["method"] == "odometry"]
     arms = own["map_by_rotation_m"], own["map_by_translation_m"]

@@ -350,7 +350,8 @@ def mx5(made: pd.DataFrame, of_clouds: pd.DataFrame) -> Iterator[Claim]:
         label = f"share of nodes with a route neighbour in their cluster, {place}"
         found = mean_interval(part)
         claim = judge_bounds(about, label, found, at_least=0.8, criterion="above 0.8")
-        yield beside(claim, is_made)
+        facts = {"n": len(part), "below": int((part < 0.8).sum())}
+        yield beside(replace(claim, facts={**claim.facts, **facts}), is_made)
 
 
 def mx6(starts: pd.DataFrame) -> Claim:

@@ -132,6 +132,8 @@ def pb3(
         label = f"relative bias, the worse of kr and kl: {where}"
         verdict = overall([judge_interval(bias, -0.05, 0.05) for bias in biases])
         claim = dataclasses.replace(judge_bounds(about, label, worse, -0.05, 0.05), verdict=verdict)
+        repetitions = int(slips["seed"].nunique())
+        claim = dataclasses.replace(claim, facts={**claim.facts, "repetitions": repetitions})
         yield beside(claim, method != REPORTS)
     for row in engine_k.itertuples():
         label = (
@@ -143,7 +145,8 @@ def pb3(
     limits = np.abs(descent["k_in_the_end"] - 0.5)
     what = "the report's program: largest distance of its limit from 1/2, on its example data"
     about = Subject("PB3", "gradient descent")
-    yield shown(about, what, Interval.exact(float(limits.max())), "it should be kr or kl")
+    remark = "its limit should be kr or kl, which are some 1e-5 to 1e-3 m"
+    yield shown(about, what, Interval.exact(float(limits.max())), remark)
     if ends is not None and found is not None:
         yield from pb3_short_turns(ends, found)
 
@@ -198,6 +201,7 @@ def pb4(coverage: pd.DataFrame, engine: pd.DataFrame, cases: pd.DataFrame) -> It
             power=min(powers),
             facts={
                 "case": case, "runs": runs, "straight_m": length_m.get(case), "band": _BAND,
+                "within": parts.count(Verdict.REPRODUCED), "cases": len(parts),
             },
         )  # fmt: skip
         yield beside(claim, k > HELD_UP_TO_M * (1 + 1e-9))
@@ -208,10 +212,14 @@ def pb4(coverage: pd.DataFrame, engine: pd.DataFrame, cases: pd.DataFrame) -> It
     if "runs_without_lag" in coverage:
         for k, table in coverage.groupby("k_m"):
             columns = ("in_ellipse", "runs"), ("in_ellipse_without_lag", "runs_without_lag")
-            lagging, at_once = ((table[hits] / table[n]).mean() for hits, n in columns)
-            label = f"share of ends in the ellipse, slip at once less slip with its lag, k = {k:g}"
-            about = Subject("PB4", "lag", setting=float(k))
-            yield shown(about, label, Interval.exact(float(at_once - lagging)))
+            lagging, at_once = (table[hits] / table[n] for hits, n in columns)
+            change = at_once - lagging
+            most = float(change[change.abs().idxmax()])
+            label = (
+                "share of ends in the ellipse, slip at once less slip with its lag, the manoeuvre "
+                f"in which it differs most, k = {k:g}"
+            )
+            yield shown(Subject("PB4", "lag", setting=float(k)), label, Interval.exact(most))
     for case, table in coverage.groupby("case", sort=False):
         shares = table.sort_values("k_m")
         within = (shares["in_ellipse"] / shares["runs"]).between(*_BAND).cummin()

@@ -50,7 +50,12 @@ def gi10(runs: pd.DataFrame, design: Design | None = None) -> Iterator[Claim]:
     arms = chart[JUDGED], chart[BASE]
     map_error = "error of FastSLAM's map"
     yield judge_ratio(*subject(map_error, JUDGED, BASE), arms, design, at_most=MARGIN)
-    yield own_design("GI10", "one building", (area[JUDGED] > area[BASE]))
+    yield own_design(
+        "GI10",
+        "one building",
+        area[JUDGED] > area[BASE],
+        whose="The design of the paper's other experiments",
+    )
     by_strategy = runs.groupby("strategy")
     n_robots, stopped = N_ROBOTS * by_strategy["seed"].count(), by_strategy["stopped"].sum()
     for strategy in (BASE, JUDGED):
