@@ -173,14 +173,15 @@ def test_pb4_names_the_k_at_which_the_band_is_left():
     assert judged[1].reason.startswith("2 of 2 manoeuvres within;")
     assert judged[2].reason.startswith("0 of 2 manoeuvres within;")
     assert judged[-1].found == Interval.exact(1e-3)
-    assert "holds at least 95 %" in concluded("puzzlebot2024", judged).sentence
+    assert "It holds at least 95 % there." in concluded("puzzlebot2024", judged).sentence
     assert [c.found.value for c in select_all(judged, quantity="held up to")] == [1e-4, 1e-4]
     lags = [c.found.value for c in select_all(judged, quantity="lag")]
     assert lags == pytest.approx([-0.02] * 3, abs=1e-3)
     early = coverage.assign(k_m=coverage["k_m"] / 10.0)
     said = concluded("puzzlebot2024", claims.pb4(early, ends(0.0), cases))
     assert said.verdict == "not_reproduced"
-    assert said.sentence.startswith("On a simulated straight of 2.5 m the ideal robot")
+    assert "In all 2 it does up to k = 1e-05 m. " in said.sentence
+    assert "ith 0.0001 m it does in 0 of 2, and holds " in said.sentence
 
 
 def ends(gap_m):

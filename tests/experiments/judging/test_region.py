@@ -191,7 +191,7 @@ def test_the_boundary_is_said_in_the_settings_own_numbers():
     assert region.boundary.startswith("holds below 0.0001 [")
     said = region.words(FAILS)
     assert "Robot.kr matters most: the claim holds in" in said
-    assert "With the others in the middle, it holds below 0.0001 [" in said
+    assert "With the others in the middle of their ranges, it holds below 0.0001 [" in said
     assert said.endswith("to match, with robot.kr = 0.0001, it does not hold.")
     chosen = planted(lambda u: u[:, 1] - 0.5 - NEED, 8, 0.1, settings=settings)[0]
     assert boundary_in_words(chosen, 1) == "holds where it is measured"
@@ -210,7 +210,10 @@ def test_a_verdict_by_region_is_written_and_read(tmp_path):
     said = {"sentences": {"X1": "It is {{ rows[0].found|plain }}."}, "anchor": "M2 errs 9.6 m"}
     (ruled,) = conclude([found], said, {"X1": region})
     assert (ruled.verdict, ruled.at_anchor) == (Verdict.DEPENDS, HOLDS)
-    assert "K matters most. With the others in the middle, it holds below 0.7" in ruled.sentence
+    assert (
+        "K matters most. With the others in the middle of their ranges, it holds below 0.7"
+        in ruled.sentence
+    )
     assert "At the anchor, where M2 errs 9.6 m, with k = 0.5, it holds." in ruled.sentence
     (alone,) = conclude([dataclasses.replace(found, role=Role.BESIDE)], said, {"X1": region})
     assert (alone.verdict, alone.at_anchor) == (Verdict.DEPENDS, ALONE)

@@ -143,7 +143,7 @@ def test_the_papers_own_design_is_stated_with_the_claim():
     own = own_design("PB1", "one drive", [True, True, False])
     (said,) = conclude([claim, own], {"sentences": {"PB1": "It is so."}})
     assert said.sentence == (
-        "It is so. The paper's own design, one drive, shows what it says in 2 of 3 repetitions."
+        "It is so. The paper's own design, one drive, shows what is claimed in 2 of 3 repetitions."
     )
     assert said.verdict == "reproduced"
 

@@ -42,7 +42,10 @@ def test_a_claim_is_decided_goes_on_or_is_capped():
 
 def test_as_good_as_at_the_limit_decides_against_the_claim():
     same = judged(0.0, 160, spread=0.1)
-    assert (same.verdict, same.reason) == ("not_reproduced", "within 10 % of it")
+    assert (same.verdict, same.reason) == (
+        "not_reproduced",
+        "within 10 %, its smallest effect of interest",
+    )
     assert judged(0.0, 160, spread=0.1, at_least=0.8, at_most=1.25).verdict == "reproduced"
 
 

@@ -83,16 +83,17 @@ def test_what_is_only_shown_stands_beside():
 def test_an_undecided_sentence_states_the_power_of_its_size():
     assert verdict_of(GOOD).sentence == "There are 1 rows."
     assert verdict_of(GOOD, OPEN).sentence == (
-        "There are 2 rows. Of studies of this size, 99 of 100 would show that two arms are alike, "
-        "if they are."
+        "There are 2 rows. Undecided is “a third”, 1.2 [1.1, 1.3], as the interval contains the "
+        "limit (within 0.8 and 1.25); more data would decide it. With data of this size, two arms "
+        "that are alike would be shown to be so in 99 of 100 studies."
     )
     low = judge_bounds(FUSED, "a ratio", Interval(1.05, 0.95, 1.16), at_most=1.1)
     assert verdict_of(OPEN, low).sentence.endswith(
-        "46 of 100 would decide an effect of 10 %, if there is one."
+        "an effect of 10 %, if there is one, would be decided in 46 of 100 studies."
     )
     unknown = dataclasses.replace(OPEN, power=math.nan)
     assert verdict_of(unknown).sentence == "There are 1 rows."
-    assert "99 of 100 would" in verdict_of(OPEN, beside(low), unknown).sentence
+    assert "in 99 of 100 studies" in verdict_of(OPEN, beside(low), unknown).sentence
 
 
 def test_the_power_of_a_size_is_that_of_tests_of_its_size():
@@ -218,7 +219,7 @@ def test_every_claim_has_one_verdict_and_a_plain_sentence(tracked):
         assert "nan" not in each.sentence
         assert not re.search(r"unknown times|unknown share|\de\+\d", each.sentence)
         if each.verdict is Verdict.UNDECIDED:
-            why = r"of 100 would |interval of this share contains [28]0 %"
+            why = r"of 100 studies|interval of this share contains [28]0 %"
             assert re.search(why, each.sentence)
 
 

@@ -64,7 +64,7 @@ def test_dc1_does_not_rank_icp_and_odometry():
     assert verdicts(found)["position RMSE, icp over odometry"] == "not_reproduced"
     said = ruled(found)
     assert said.verdict == "reproduced"
-    assert re.search(r"one drive, shows what it says in (1\d|20) of 20 rep", said.sentence)
+    assert re.search(r"one drive, shows what is claimed in (1\d|20) of 20 rep", said.sentence)
 
 
 def test_dc1_tells_what_the_start_from_the_wheels_adds():
@@ -247,7 +247,7 @@ def test_dc5_states_which_metric_is_more_stable():
 def test_dc6_follows_the_maps_and_their_cause():
     assert set(verdicts(claims.dc6(runs(**RIGHT))).values()) == {"reproduced"}
     found = verdicts(claims.dc6(runs(**RIGHT | {"odometry": 0.1})))
-    for what in ("distance of map points to walls", "exp of map entropy"):
+    for what in ("distance of map points to walls", "exponential of the map's entropy (its blur)"):
         assert found[f"{what}, fusion over odometry"] == "not_reproduced"
     slipping = runs(**RIGHT).assign(map_by_translation_m=5.0)
     found = claims.dc6(slipping)

@@ -75,7 +75,7 @@ def test_gi1_holds_slam_against_odometry():
     assert "course of 146 m" in first
     assert "second course, of four laps" in second
     assert (
-        "The paper's own design, one drive, shows what it says in 20 of 20 repetitions."
+        "The paper's own design, one drive, shows what is claimed in 20 of 20 repetitions."
         in said.sentence
     )
 

@@ -40,7 +40,7 @@ def test_the_sentence_says_the_factors():
     [conclusion] = conclude(found, findings("exploration"))
     assert conclusion.verdict is Verdict.REPRODUCED
     assert "1.3] times the area" in conclusion.sentence
-    assert "one building, shows what it says in 20 of 20 repetitions" in conclusion.sentence
+    assert "one building, shows what is claimed in 20 of 20 repetitions" in conclusion.sentence
     share = select(found, quantity="hit something", method=settings.JUDGED)
     assert share.found.value == 1.0 / (settings.N_ROBOTS * 20)
 

@@ -49,7 +49,9 @@ def test_rl2_judges_the_paired_difference(low, high, verdict):
     assert {c.verdict for c in found[:4]} == {verdict}
     assert found[0].statistic.startswith("translational error of EKF of wheels and ICP less")
     assert ("The log is too short" in said(found)) == (verdict == "undecided")
-    assert ("would decide an effect of 0.1" in said(found)) == (verdict == "undecided")
+    assert ("an effect of 0.1, if there is one, would be decided" in said(found)) == (
+        verdict == "undecided"
+    )
 
 
 def test_rl2_counts_arms_within_a_tenth_as_alike():
@@ -63,7 +65,7 @@ def test_rl2_counts_arms_within_a_tenth_as_alike():
 def test_rl1_rl4_and_rl5_can_fail():
     ate = pd.DataFrame({"ate_m": [0.1491, 0.2272], "printed_m": ["0.149", "0.227"]})
     assert rl1(ate).verdict == "reproduced"
-    assert said([rl1(ate)]) == "100 % of 2 errors have every printed digit."
+    assert said([rl1(ate)]).startswith("All digits agree in 100 % of 2 printed errors.")
     assert rl1(ate.assign(ate_m=[0.1496, 0.2272])).verdict == "not_reproduced"
     wheels = pd.DataFrame({"value": [0.0415, 0.0880], "published": [0.0414, 0.0880]})
     cases = ["geometric width", "calibrated", HELD_OUT]
