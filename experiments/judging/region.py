@@ -159,7 +159,10 @@ class Region:
         elif self.boundary not in (NOWHERE, EVERYWHERE):
             reverses = LEAST <= self.share.value <= MOST
             said += [
-                f"No single setting {'decides' if reverses else 'reverses it'}; it {self.boundary}."
+                "No single setting tells clearly where. What tells most is this division of the "
+                f"region: it {self.boundary}."
+                if reverses
+                else f"No single setting reverses it; it {self.boundary}."
             ]
         if self.boundary in (NOWHERE, EVERYWHERE):
             said += ["Nothing beyond the ranges was tried, so what would change this is not known."]

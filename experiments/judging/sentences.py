@@ -134,7 +134,8 @@ def percent(share: float | Interval) -> str:
 
 def bracketed(found: Interval) -> str:
     """Write a value with its interval in brackets."""
-    return f"{plain(found)} [{plain(found.low)}, {plain(found.high)}]"
+    value, low, high = (plain(each, 3) for each in (found.value, found.low, found.high))
+    return f"{value} [{low}, {high}]"
 
 
 def ends(found: Interval) -> str:

@@ -358,7 +358,9 @@ def mx6(starts: pd.DataFrame) -> Claim:
     """Our own: global localization on simulated clouds."""
     label = "share of starts localised on campus clouds (our own)"
     about = Subject("MX6", "starts", setting=WITHIN)
-    return _share(about, label, starts["settled_at"] <= WITHIN, at_least=0.95)
+    claim = _share(about, label, starts["settled_at"] <= WITHIN, at_least=0.95)
+    facts = {"n": len(starts), "worlds": int(starts["seed"].nunique())}
+    return replace(claim, facts={**claim.facts, **facts})
 
 
 def mx7(starts: pd.DataFrame) -> Claim:
@@ -381,4 +383,5 @@ def mx8(kidnapping: pd.DataFrame) -> Iterator[Claim]:
             f"share recovered within {RECOVERED_WITHIN} nodes {arm} injection, "
             f"{NAMES[name]} (our own)"
         )
-        yield _share(about, label, recovered, *((0.95,) if injects else (-math.inf, 0.5)))
+        claim = _share(about, label, recovered, *((0.95,) if injects else (-math.inf, 0.5)))
+        yield replace(claim, facts={**claim.facts, "n": len(recovered)})
