@@ -64,4 +64,4 @@ def test_a_region_that_two_settings_decide_alike_has_a_boundary_in_both():
     assert region.decided_by == NONE_ALONE
     assert "wheel slip, m is below" in region.boundary
     assert "B is below" in region.boundary
-    assert f"No single setting decides; it {region.boundary}." in region.words(Verdict.REPRODUCED)
+    assert f"division of the region: it {region.boundary}." in region.words(Verdict.REPRODUCED)

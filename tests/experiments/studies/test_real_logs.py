@@ -95,7 +95,7 @@ def test_rl3_wants_every_robot():
         ("FastSLAM", "known"): ("not_reproduced", "robots 1, 2, 3; not on robots 1, 3"),
         ("EKF-SLAM", "unknown"): ("not_reproduced", "robots 2, 3; not on robot 3"),
     }
-    assert "With known ids: FastSLAM (slip in bursts) 0.1 to 1.5 (not below on robots 1, 3). " in (
+    assert "landmarks: FastSLAM (slip in bursts) 0.1 to 1.5 (not below 1 on robots 1, 3). " in (
         said(found)
     )
     table["judged"] = table["robot"] < 3  # robots on which the noise was chosen stand beside
