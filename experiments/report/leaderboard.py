@@ -66,15 +66,16 @@ def on_lasers(path: Path) -> dict[str, Any]:
     """The methods of the least position error with a laser, beside other projects'.
 
     A method and its tuned variant are one, of which the better is shown. Level with the first is
-    whose ratio of errors to it has an interval that holds 1.
+    which answers as it does (online or revised) and whose ratio of errors to it has an interval
+    that holds 1.
 
     Returns
     -------
     dict
         `rows`, the best method first, at most `MOST`, each with its `method`, `project`, `error`,
-        whether it is `ours` and `level` with the first, and the `ratio` of its error to the first's
-        in words (empty for the first); `n_methods`, `runs` and `others`, the best row of another
-        project (or None). Empty without such a table.
+        whether it is `ours` and `level` with the first, and the `ratio` of its error to that of the
+        best that answers alike, in words (empty for that); `n_methods`, `runs` and `others`, the
+        best row of another project (or None). Empty without such a table.
     """
     found = read_rows(path) if path.exists() else pd.DataFrame()
     if not {"sensor", "estimator", "project", "runs", "ate_rmse_m"} <= {*found}:
@@ -89,7 +90,10 @@ def on_lasers(path: Path) -> dict[str, Any]:
     # the table's ratios are to the best of each board: they say nothing beside another that leads
     first = laser.iloc[0]
     known = {"over_best", "low", "high"} <= {*laser} and first.get("over_best") == 1.0
-    rows = [_of_lasers(row, known and i > 0) for i, (_, row) in enumerate(laser.iterrows())]
+    rows = [
+        _of_lasers(row, known and i > 0, row.get("answer") == first.get("answer"))
+        for i, (_, row) in enumerate(laser.iterrows())
+    ]
     return {
         "rows": rows[:MOST],
         "n_methods": len(rows),
@@ -98,9 +102,9 @@ def on_lasers(path: Path) -> dict[str, Any]:
     }
 
 
-def _of_lasers(row: pd.Series[Any], compared: bool) -> dict[str, Any]:
+def _of_lasers(row: pd.Series[Any], compared: bool, alike: bool) -> dict[str, Any]:
     ratio = ""
-    if compared:
+    if compared and row["over_best"] != 1.0:
         value, low, high = (significant(row[c], 2) for c in ("over_best", "low", "high"))
         ratio = f"{value} [{low}, {high}]"
     return {
@@ -108,7 +112,7 @@ def _of_lasers(row: pd.Series[Any], compared: bool) -> dict[str, Any]:
         "project": row["project"],
         "ours": row["project"] == "Estima",
         "error": significant(float(row["ate_rmse_m"]), 2),
-        "level": compared and row["low"] <= 1.0 <= row["high"],
+        "level": compared and alike and row["low"] <= 1.0 <= row["high"],
         "ratio": ratio,
     }
 

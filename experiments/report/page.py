@@ -85,6 +85,8 @@ def interval(row: Mapping[str, Any]) -> str:
     if math.isnan(row["value"]):
         return ""
     value, low, high = (_number(row[name]) for name in ("value", "low", "high"))
+    if math.isnan(row["low"]) and math.isnan(row["high"]):
+        return f"{value}, without an interval"
     return value if row["low"] == row["high"] == row["value"] else f"{value} [{low}, {high}]"
 
 

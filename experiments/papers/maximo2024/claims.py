@@ -47,7 +47,7 @@ _PAPERS, _BETWEEN = "the paper's", f"{BETWEEN_NODES_S:g} s between nodes"
 _FAILS, _HOLDS = 5.0, 1.25  # M3's error over M2's: above on Oxford, within on UMH
 _EQUAL = 1.15  # errors by number of particles, and from other starts
 _NEAREST = 1.1  # M2's error over the distance to the nearest node, or its inverse
-_WORST_MX2 = f"error with 2 or 8 particles a node over 4, within {_EQUAL:g}"
+_WORST_MX2 = f"error with 2, 6 or 8 particles a node over 4, within {_EQUAL:g}"
 
 
 def _both(first: str, second: str, words: str, most: float, least: float = 0.0) -> list[Compared]:
