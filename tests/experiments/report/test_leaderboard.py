@@ -41,3 +41,14 @@ def test_a_tuned_method_is_no_second_one_and_ties_are_said(tmp_path):
     assert [row["level"] for row in shown] == [False, True, False]
     write_frame(pd.DataFrame(rows | {"low": [1, 1, 1.05, 1.05, 1.5]}), path)
     assert not any(row["level"] for row in leaderboard.on_lasers(path)["rows"])
+
+
+def test_a_method_is_compared_with_the_best_that_answers_alike(tmp_path):
+    path = tmp_path / "peers_methods.csv"
+    rows = {"sensor": "laser", "estimator": ["a", "b", "c"], "runs": 15, "project": "Estima"}
+    rows |= {"ate_rmse_m": [0.003, 0.004, 0.005], "answer": ["revised", "online", "online"]}
+    rows |= {"over_best": [1, 1, 1.2], "low": [1, 1, 0.9], "high": [1, 1, 1.6]}
+    write_frame(pd.DataFrame(rows), path)
+    shown = leaderboard.on_lasers(path)["rows"]
+    assert [row["ratio"] for row in shown] == ["", "", "1.2 [0.90, 1.6]"]
+    assert not any(row["level"] for row in shown)
