@@ -71,7 +71,7 @@ def digest_of_defaults(options):
 # A default decides results: who changes one says so in CHANGELOG.md, and here.
 DEFAULTS = {
     "DifferentialDrive": "4c424886",
-    "EkfIcp": "1c08f29d",
+    "EkfIcp": "0a9f9bed",
     "EkfIcpPaper": "ef960ab5",
     "EkfSlam": "3a17fe07",
     "Encoder": "9c7c1c0b",
