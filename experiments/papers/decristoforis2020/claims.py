@@ -2,7 +2,6 @@
 
 import itertools
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -167,7 +166,7 @@ def dc3(ellipses: pd.DataFrame, design: Design | None = None) -> list[Claim]:
         far = by_world[by_world > _FAR_TURN_DEG]
         near = by_world[by_world <= _FAR_TURN_DEG]
         facts = {"n": len(by_world), "far": far.tolist(), "near": near.tolist()}
-        claims.append(beside(replace(claim, facts={**claim.facts, **facts}), is_beside))
+        claims.append(beside(with_remark(claim, "", **facts), is_beside))
         about = Subject("DC3", "median", method=method, place=bend)
         typical = log_ratio_interval(median, before)
         claims.append(shown(about, f"median long axis in {what} over before", typical))

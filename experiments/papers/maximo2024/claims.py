@@ -351,7 +351,7 @@ def mx5(made: pd.DataFrame, of_clouds: pd.DataFrame) -> Iterator[Claim]:
         found = mean_interval(part)
         claim = judge_bounds(about, label, found, at_least=0.8, criterion="above 0.8")
         facts = {"n": len(part), "below": int((part < 0.8).sum())}
-        yield beside(replace(claim, facts={**claim.facts, **facts}), is_made)
+        yield beside(with_remark(claim, "", **facts), is_made)
 
 
 def mx6(starts: pd.DataFrame) -> Claim:
@@ -360,7 +360,7 @@ def mx6(starts: pd.DataFrame) -> Claim:
     about = Subject("MX6", "starts", setting=WITHIN)
     claim = _share(about, label, starts["settled_at"] <= WITHIN, at_least=0.95)
     facts = {"n": len(starts), "worlds": int(starts["seed"].nunique())}
-    return replace(claim, facts={**claim.facts, **facts})
+    return with_remark(claim, "", **facts)
 
 
 def mx7(starts: pd.DataFrame) -> Claim:
@@ -384,4 +384,4 @@ def mx8(kidnapping: pd.DataFrame) -> Iterator[Claim]:
             f"{NAMES[name]} (our own)"
         )
         claim = _share(about, label, recovered, *((0.95,) if injects else (-math.inf, 0.5)))
-        yield replace(claim, facts={**claim.facts, "n": len(recovered)})
+        yield with_remark(claim, "", n=len(recovered))
