@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from estimators.on_a_map.walls import Nearest, nearest_walls, walls_of
 from sim import se2
 from sim.arrays import Array, Floats, Ints
 from sim.compiled import njit
@@ -58,6 +59,10 @@ class LikelihoodField:
         Rows and columns (F, 2) of the cells where a robot can be: the largest connected floor off
         the walls. What is shut in, such as the inside of furniture, does not count, nor does what
         a grid does not know to be free.
+    walls
+        (W, 4) that the laser sees, m; points, on a grid.
+    nearest
+        (rows, columns) which of them is the nearest; -1 where none is near.
     """
 
     table: NDArray[np.uint16]
@@ -65,6 +70,8 @@ class LikelihoodField:
     cell_m: float
     step: float
     free_cells: Ints
+    walls: Array
+    nearest: Nearest
 
     def holds(self, pose: Array) -> bool:
         """Whether a pose (3,) lies on the table, rather than off the map."""
@@ -130,7 +137,7 @@ def likelihood_field(
     InputError
         If no wall is at that height, or the table would be too large.
     """
-    walls, extent = _walls(known_map, laser)
+    walls, extent = walls_of(known_map, laser)
     cell_m, sigma_m = believed.cell_m, believed.sigma_m
     floor_p = math.exp(-believed.max_loss)
     # Beyond this distance hits are a thousandth of what the map does not explain
@@ -146,7 +153,7 @@ def likelihood_field(
         f"estimator.cell_m={cell_m} makes {n_cells:.3g} cells of {where}; make it larger",
     )
     columns, rows = sides.astype(int).tolist()
-    distances = _distances(walls, origin, cell_m, reach_m, rows, columns)
+    distances, nearest = nearest_walls(walls, origin, cell_m, reach_m, rows, columns)
     p = np.exp(-0.5 * np.square(distances / sigma_m)) + floor_p
     floor = distances > _CLEARANCE_M
     if isinstance(known_map, OccupancyGrid):
@@ -160,25 +167,7 @@ def likelihood_field(
         floor &= within  # the walls' rectangle
     step = math.log1p(1.0 / floor_p) / _MOST
     table = np.round((math.log1p(floor_p) - np.log(p)) / step).astype(np.uint16)
-    return LikelihoodField(table, origin, cell_m, step, _largest(floor))
-
-
-def _walls(known_map: World | OccupancyGrid, laser: Laser) -> tuple[Array, Array]:
-    """Walls (W, 4) that the laser sees, m, and points (N, 2) that span the map.
-
-    Of a grid the walls are points: the middles of the occupied cells that have others beside them.
-    """
-    if isinstance(known_map, OccupancyGrid):
-        occupied = known_map.occupied
-        middles = known_map.middles_m(np.argwhere(occupied & ~ndimage.binary_erosion(occupied)))
-        require(len(middles) > 0, "the grid of prior.map has no occupied cell")
-        return np.hstack([middles, middles]), known_map.corners_m
-    low, high = known_map.wall_z_m[:, 0], known_map.wall_z_m[:, 1]
-    walls = known_map.walls[(low <= laser.mount.z_m) & (laser.mount.z_m <= high)]
-    require(
-        len(walls) > 0, f"world {known_map.name} has no wall at the laser's {laser.mount.z_m} m"
-    )
-    return walls, walls.reshape(-1, 2)
+    return LikelihoodField(table, origin, cell_m, step, _largest(floor), walls, nearest)
 
 
 def _states(
@@ -203,8 +192,12 @@ def _largest(floor: NDArray[np.bool_]) -> Ints:
     return np.argwhere(labels == largest)
 
 
-def beam_ends(ranges_m: Floats, laser: Laser, n_beams: int) -> Floats:
+def beam_ends(
+    ranges_m: Floats | Array, laser: Laser, n_beams: int, bearings_rad: Array | None = None
+) -> Floats:
     """Where beams end in base_link, (2, B) m: `n_beams` evenly spaced ones, less those unseen.
+
+    With `bearings_rad` (N,), those of a scan taken to one instant, in place of the laser's.
 
     Beams without a reading (NaN) are not counted; if none of the chosen ones saw anything, they are
     chosen among those that did.
@@ -219,7 +212,7 @@ def beam_ends(ranges_m: Floats, laser: Laser, n_beams: int) -> Floats:
     if not seen[chosen].any():
         chosen = _spread(np.flatnonzero(seen), n_beams)
     chosen = chosen[seen[chosen]]
-    bearings = laser.bearings_rad[chosen]
+    bearings = (laser.bearings_rad if bearings_rad is None else bearings_rad)[chosen]
     rays = np.column_stack([np.cos(bearings), np.sin(bearings)])
     ends = se2.transform(laser.mount.pose, rays * ranges[chosen, None])
     return np.ascontiguousarray(ends.T, dtype=np.float32)
@@ -229,35 +222,6 @@ def _spread(places: Ints, max_particles: int) -> Ints:
     """At most `max_particles` of the places, evenly spaced."""
     n = min(max_particles, len(places))
     return places[((np.arange(n) + 0.5) * (len(places) / max(n, 1))).astype(np.int64)]
-
-
-@njit()
-def _distances(
-    walls: Array, origin: Array, cell_m: float, reach_m: float, rows: int, columns: int
-) -> Array:
-    """Distance (rows, columns) of each cell's middle to the nearest wall within reach, else inf."""
-    squares = np.full((rows, columns), np.inf)
-    for w in range(len(walls)):
-        x1, y1 = walls[w, 0] - origin[0], walls[w, 1] - origin[1]
-        dx, dy = walls[w, 2] - walls[w, 0], walls[w, 3] - walls[w, 1]
-        length_square = dx * dx + dy * dy
-        per_square = 1.0 / length_square if length_square > 0.0 else 0.0  # of a point
-        first_row = max(int((min(y1, y1 + dy) - reach_m) / cell_m), 0)
-        last_row = min(int((max(y1, y1 + dy) + reach_m) / cell_m) + 1, rows)
-        first = max(int((min(x1, x1 + dx) - reach_m) / cell_m), 0)
-        last = min(int((max(x1, x1 + dx) + reach_m) / cell_m) + 1, columns)
-        for i in range(first_row, last_row):
-            y = (i + 0.5) * cell_m - y1
-            for j in range(first, last):
-                x = (j + 0.5) * cell_m - x1
-                share = min(max((x * dx + y * dy) * per_square, 0.0), 1.0)
-                square = (x - share * dx) ** 2 + (y - share * dy) ** 2
-                squares[i, j] = min(squares[i, j], square)
-    for i in range(rows):
-        for j in range(columns):
-            d = math.sqrt(squares[i, j])
-            squares[i, j] = d if d < reach_m else np.inf
-    return squares
 
 
 @njit(fastmath=True)

@@ -4,6 +4,8 @@ Particles roll by the wheels, are weighted by a likelihood field, and are resamp
 follows the spread of the belief: as many as the bins of pose that they fall into call for (KLD
 sampling; Fox 2003).
 
+Where in one hypothesis the robot is, all the beams say by a fit to the walls (see `wall_fit`).
+
 The likelihood of a beam is bounded (see `likelihood_field`), so people and moved furniture, which
 the map lacks, cannot outweigh the walls. It is wide while the belief is wide, and sharp after that.
 
@@ -24,12 +26,14 @@ from pydantic import Field
 
 from estimators.base import Belief, LaserOptions, Prior
 from estimators.gaussian import STILL, Gaussian, root
+from estimators.laser.sweep import at_stamp
+from estimators.on_a_map.bins import BinOptions, Bins
 from estimators.on_a_map.likelihood_field import (
     FieldOptions,
-    LikelihoodField,
     beam_ends,
     likelihood_field,
 )
+from estimators.on_a_map.wall_fit import WallFit
 from estimators.particles import (
     Scheme,
     effective_sample_size,
@@ -39,7 +43,7 @@ from estimators.particles import (
 )
 from estimators.wheels import WheelOptions, WheelPrediction
 from sim import se2
-from sim.arrays import Array, Floats, Ints
+from sim.arrays import Array, Floats
 from sim.compiled import njit
 from sim.errors import require
 from sim.options import Count, NonNegative, Positive, options
@@ -54,63 +58,7 @@ _ASKED = 32  # particles of which a scan that is not used is asked
 _SAMPLED = 16  # one in so many poses tried on the floor decides by how much a scan counts there
 _MOST_PARTICLES, _MOST_TRIES = 10_000_000, 100_000_000  # 0.2 and 2 GB of poses
 _FARTHEST_M, _FARTHEST_RAD = 1.0, 0.5  # of what belongs to one hypothesis
-_MOST_BINS = 250_000_000  # 2 GB
-
-
-@options("estimator")
-class BinOptions:
-    """Bins of pose, and how near to the belief a draw must come."""
-
-    kld_error: Positive = 0.05
-    """KLD sampling: the draw differs from the belief by at most this much."""
-    kld_quantile: NonNegative = 2.33
-    """Standard normal quantile of the probability of that (2.33: 99 %)."""
-    bin_m: Positive = 0.5
-    """Side of the bins that KLD sampling counts, m."""
-    bin_rad: Positive = 0.17
-    """Width of the bins in heading, rad."""
-
-
-class Bins:
-    """Bins of pose over a field.
-
-    Raises
-    ------
-    InputError
-        If there would be too many.
-    """
-
-    def __init__(self, field: LikelihoodField, believed: BinOptions) -> None:
-        self._believed, self._origin_m = believed, field.origin_m
-        sides_m = field.cell_m * np.array(field.table.shape[::-1])
-        sizes = [*sides_m / believed.bin_m, 2.0 * math.pi / believed.bin_rad]
-        with np.errstate(over="ignore"):  # counted in floats, which do not wrap
-            shape = np.ceil(np.array(sizes))
-            n_bins = float(np.prod(shape))
-        require(
-            n_bins <= _MOST_BINS,
-            f"estimator.bin_m={believed.bin_m} and bin_rad={believed.bin_rad} make {n_bins:.3g} "
-            "bins of the map; make them larger",
-        )
-        self._shape: list[int] = shape.astype(int).tolist()
-
-    def number(self, poses: Array) -> Ints:
-        """Number of the bin (M,) of each pose (M, 3); poses off the map go to bins at its edge."""
-        columns, rows, n_headings = self._shape
-        x, y = ((poses[:, i] - self._origin_m[i]) / self._believed.bin_m for i in (0, 1))
-        heading = np.floor((poses[:, 2] + math.pi) / self._believed.bin_rad).astype(np.int64)
-        column = np.clip(x.astype(np.int64), 0, columns - 1)
-        row = np.clip(y.astype(np.int64), 0, rows - 1)
-        return np.asarray((row * columns + column) * n_headings + heading % n_headings)
-
-    def count_particles(self, poses: Array) -> int:
-        """Particles that the number of bins in use by poses (M, 3) calls for."""
-        k = len(np.unique(self.number(poses)))
-        if k < 2:
-            return 1
-        a = 2.0 / (9.0 * (k - 1))
-        cube = (1.0 - a + math.sqrt(a) * self._believed.kld_quantile) ** 3
-        return math.ceil((k - 1) / (2.0 * self._believed.kld_error) * cube)
+_ONE_HYPOTHESIS = 0.9  # share of the weight from which on a scan is fitted in it
 
 
 @options("estimator")
@@ -130,6 +78,9 @@ class MclOptions(WheelOptions, FieldOptions, BinOptions, LaserOptions):
     """The same while the belief calls for more than `min_particles`, and of poses drawn over the
     floor: a sharp likelihood would pass between the particles (Pfaff, Burgard, Fox 2006, Robust
     Monte-Carlo localization using adaptive likelihood models)."""
+    fit_walls: bool = True
+    """Answer by a fit of all beams to the walls in the heaviest hypothesis, rather than by the
+    mean of its particles. The particles do not depend on it."""
     min_ess: NonNegative = 0.4
     """A scan counts for less when it would leave less than this share of the particles; below
     `ess_share`."""
@@ -192,15 +143,17 @@ class Mcl(MclOptions):
     `amcl_alphas` converts kr and kl for AMCL.
 
     The defaults find the robot anywhere and keep it among people; tempering and jitter make the
-    belief wider than its error. A tracker that knows its error wants beam_power=1, min_ess=0,
-    sigma_m of 0.05, and no jitter; it is consistent then.
+    particles spread wider than their mean errs. The belief is the fit of all beams to the walls,
+    where there is one hypothesis and the fit holds, with its covariance, else that of the
+    particles. Particles that know their error, without the fit, want beam_power=1, min_ess=0,
+    sigma_m of 0.05, and no jitter.
 
     Without a start pose the particles are drawn by the first scan, and later ones are injected by
     the current one: along a corridor, where long beams fix the heading closely, a uniform draw
     would leave none near the truth.
 
-    The mean is that of the hypothesis (particles within 1 m and 0.5 rad) of greatest weight; the
-    covariance is that of all particles about it, so it shows whether there are others. Extras, of
+    The particles' mean is that of the hypothesis (within 1 m and 0.5 rad) of greatest weight; the
+    covariance is that of all of them about it, so it shows whether there are others. Extras, of
     the last scan used: `particles` (M, 3), `log_weights` (M,), `ess`, `hypothesis_weight`,
     `fit`, the likelihood of a beam at the best particle, `lost`, 1 less the product of these two
     (of a scan that was not used, too), and `injected`, the number of particles injected, those of
@@ -238,18 +191,24 @@ class Mcl(MclOptions):
         variance = self._laser.sigma_range_m**2 + self.cell_m**2 / 6.0
         self._slow = self._fast = math.exp(-0.5 * variance / self.sigma_m**2)
         self._seen = False
+        self._wall_fit = WallFit(self._field, prior.map, self._laser) if self.fit_walls else None
+        self._fitted: Gaussian | None = None
         self._extras: dict[str, Any] = {}
         self._belief = self._summed_up()
 
     def step(self, frame: Frame) -> Belief:
         """Roll by the wheels; with a scan from a new place, weight and resample."""
-        self._motion = self._motion.then(self._wheels.predict(frame))
+        rolled = self._wheels.predict(frame)
+        self._motion = self._motion.then(rolled)
         extras: dict[str, Any] = {"status": "start off the map"} if self._off_map else {}
         self._off_map = False
         scan = frame.readings.get(self.laser)
         is_due = self._is_due()
         if scan is not None:
-            ends = beam_ends(scan["ranges_m"], self._laser, self.n_beams)
+            ranges_m, bearings_rad = at_stamp(
+                scan["ranges_m"], self._laser, rolled.mean, frame.duration_s
+            )
+            ends = beam_ends(ranges_m, self._laser, self.n_beams, bearings_rad)
         if scan is not None and not is_due and ends.shape[1]:
             extras["lost"] = self._doubt(ends)
         if scan is not None and is_due:
@@ -261,8 +220,22 @@ class Mcl(MclOptions):
             else:
                 self._weigh(ends)
         now = self._belief.then(self._motion)
-        symmetric = (now.covariance + now.covariance.T) / 2.0
-        return Belief(now.mean.copy(), symmetric, self._extras | extras)
+        if scan is not None:
+            slip = rolled.covariance / max(frame.duration_s, 1e-9)
+            self._fitted = self._fit(now, ranges_m, bearings_rad, slip, learn=is_due)
+        elif self._fitted is not None:
+            self._fitted = self._fitted.then(rolled)
+        said = self._fitted or now
+        symmetric = (said.covariance + said.covariance.T) / 2.0
+        return Belief(said.mean.copy(), symmetric, self._extras | extras)
+
+    def _fit(
+        self, now: Gaussian, ranges_m: Array, bearings_rad: Array, slip: Array, *, learn: bool
+    ) -> Gaussian | None:
+        """Fit a scan to the walls, if there is one hypothesis; None if it does not fit."""
+        if self._wall_fit is None or self._extras["hypothesis_weight"] < _ONE_HYPOTHESIS:
+            return None
+        return self._wall_fit.fit(now, ranges_m, bearings_rad, slip, learn=learn)
 
     def _is_due(self) -> bool:
         """Whether the robot has come far enough since the last scan used."""

@@ -87,7 +87,7 @@ DEFAULTS = {
     "KissIcp": "71303030",
     "Laser": "e752606f",
     "Lidar3D": "29cea5d0",
-    "Mcl": "05dfa09a",
+    "Mcl": "a1971896",
     "Odometry": "3fb34598",
     "Offline": "f6fdb4d2",
     "PlaceDescriptor": "af6aa1df",
