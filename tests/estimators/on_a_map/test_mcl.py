@@ -264,3 +264,17 @@ def test_wrong_input_is_named():
             InputError, match=f"estimator.*{next(iter(options))}=.* bins of the map"
         ):
             Mcl(max_particles=1000, **options).reset(prior(), rng)
+
+
+def test_the_fit_is_the_better_answer_and_leaves_the_particles_alone():
+    poses, frames = drive(ROOM, 100, wheel_noise_m=NOISE_M)
+    told = {}
+    for fitted in (True, False):
+        estimator = Mcl(max_particles=2000, fit_walls=fitted, **WHEELS)
+        told[fitted] = follow(estimator, frames, prior())
+    for with_fit, without in zip(told[True], told[False], strict=True):
+        np.testing.assert_array_equal(with_fit.extras["particles"], without.extras["particles"])
+    for by_fit, by_particles in zip(
+        errors(told[True], poses), errors(told[False], poses), strict=True
+    ):
+        assert 3.0 * np.sqrt(np.mean(by_fit**2)) < np.sqrt(np.mean(by_particles**2))
