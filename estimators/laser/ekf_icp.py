@@ -45,6 +45,7 @@ _MOST_WEAKENED = 150.0  # times its variance that the innovation of one may have
 _REVISIT_M = 0.5  # standard deviation of where it is; at more, graph_slam has to close the loop
 # Slip that the wheels' noise does not describe
 _AGREES = 1e-3  # share of registrations of a scan that differ more if they err as believed
+_BORNE_OUT = 3.0  # points more that have to bear it out than the wheels
 _RELEARNT = 0.1  # weight of a scan in how much the wheels are believed to slip
 _MOST_SURPRISED = 4.0  # times the usual innovation that one scan may teach of it
 _NEGLIGIBLE_M2 = 1e-10
@@ -316,9 +317,12 @@ class EkfIcp(EkfIcpOptions):
     def _witnessed(self, scan: PreparedScan, match: Match, guess: Gaussian) -> bool:
         """Whether another scan sees this one where its registration with the key frame does.
 
-        Both start from the wheels' guess (of T_key_scan), so if they agree, the wheels are wrong.
+        Both start from the wheels' guess (of T_key_scan), so if they agree, the wheels are wrong;
+        unless the scans fit there as well, as along a corridor, where both err alike.
         """
-        if self._witness is None:
+        if self._witness is None or self._key is None:
+            return False
+        if self.matcher.borne_out_by(scan, self._key, match, guess, self._laser) < _BORNE_OUT:
             return False
         other, T_other_key = self._witness
         second = self.matcher.match(scan, other, T_other_key.then(guess), self._laser, self._rng)

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
 from estimators.laser.icp_iterations import Fit, Pair, Sample, Settings, Stage, align
-from estimators.laser.icp_judgement import count_agreement, judge
+from estimators.laser.icp_judgement import count_both_ways, judge
 from estimators.laser.icp_start import (
     Planes,
     as_segments,
@@ -155,12 +155,7 @@ def _register(
     normal, information, spurious = judge(pair, pose, fit)
     for matrix in (normal, information, spurious):
         matrix[0, 1], matrix[0, 2], matrix[1, 2] = matrix[1, 0], matrix[2, 0], matrix[2, 1]
-    agreed, denied = np.zeros((3, 3)), np.zeros((3, 3))
-    tolerance = _AGREEMENT * pair.noise_m
-    count_agreement(source, target, pose, pose[2], (0.0, 0.0), tolerance, agreed, denied)
-    cos, sin = math.cos(pose[2]), math.sin(pose[2])
-    back = np.array([-cos * pose[0] - sin * pose[1], sin * pose[0] - cos * pose[1], -pose[2]])
-    count_agreement(target, source, back, 0.0, (pose[0], pose[1]), tolerance, agreed, denied)
+    agreed, denied = count_both_ways(source, target, pose, _AGREEMENT * pair.noise_m)
     return fit, iterations, converged, normal, information, spurious, agreed, denied
 
 
@@ -287,6 +282,26 @@ def _judged(
         pose, metric, status, fit.matches, fit.residuals, fit.weights, iterations, converged,
         normal, information, spurious, planes,
     )  # fmt: skip
+
+
+def better_by(
+    source: PreparedScan, target: PreparedScan, pose: ArrayLike, other: ArrayLike, noise_m: float
+) -> float:
+    """How many points more bear out one pose of the source than another.
+
+    A point of either scan counts as far as its line lies across the way between the poses: for a
+    pose if it is on a line of the other scan, against it if it stands before what that one saw.
+    """
+    at, instead = np.array(pose, float), np.array(other, float)
+    way = at - instead
+    way[2] = math.remainder(way[2], 2.0 * math.pi)
+    way /= max(math.hypot(way[0], way[1]), abs(way[2]), 1e-9)
+    gain = 0.0
+    for each, sign in ((at, 1.0), (instead, -1.0)):
+        agreed, denied = count_both_ways(source, target, each, _AGREEMENT * noise_m)
+        borne_out = np.tril(agreed - denied)
+        gain += sign * float(way @ (borne_out + np.tril(borne_out, -1).T) @ way)
+    return gain
 
 
 def split_directions(registration: Registration) -> tuple[Array, Array]:

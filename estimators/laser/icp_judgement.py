@@ -112,3 +112,20 @@ def count_agreement(
             n1, n2 = rotate(c, s, normals[line, 0], normals[line, 1])
             qx, qy = rotate(c, s, px - lever[0], py - lever[1])
             add_line(agreed if near else denied, 1.0, n1, n2, qx, qy)
+
+
+@njit(error_model="numpy", fastmath={"contract"})
+def count_both_ways(
+    source: PreparedScan, target: PreparedScan, pose: Array, tolerance: float
+) -> tuple[Array, Array]:
+    """Sums (3, 3) of J J^T of the points of both scans that agree, and of those denied.
+
+    Lower halves, about the target's axes, with levers from the source's sensor; the pose is that of
+    the source in the target.
+    """
+    agreed, denied = np.zeros((3, 3)), np.zeros((3, 3))
+    count_agreement(source, target, pose, pose[2], (0.0, 0.0), tolerance, agreed, denied)
+    cos, sin = math.cos(pose[2]), math.sin(pose[2])
+    back = np.array([-cos * pose[0] - sin * pose[1], sin * pose[0] - cos * pose[1], -pose[2]])
+    count_agreement(target, source, back, 0.0, (pose[0], pose[1]), tolerance, agreed, denied)
+    return agreed, denied

@@ -25,6 +25,7 @@ from estimators.laser.icp import (
     PreparedScan,
     Registration,
     Rules,
+    better_by,
     prepare,
     register,
     split_directions,
@@ -244,6 +245,19 @@ class ScanMatcher:
         mount = laser.mount.pose
         in_laser = se2.compose(se2.compose(se2.inverse(mount), pose), mount)
         return seen_again(scan, other, in_laser)
+
+    def borne_out_by(
+        self,
+        scan: PreparedScan,
+        reference: PreparedScan,
+        match: Match,
+        guess: Gaussian,
+        laser: Laser,
+    ) -> float:
+        """How many points more bear out a match than the guess (see `icp.better_by`)."""
+        at, instead = (each.in_sensor(laser.mount.pose)[0] for each in (match.motion, guess))
+        noise_m = max(scan.noise_m, reference.noise_m)
+        return better_by(scan, reference, at.mean, instead.mean, noise_m)
 
     def sigma_m(self, laser: Laser) -> float:
         """Believed range noise, m."""

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial import KDTree
 
 from estimators.laser import icp, icp_iterations, icp_start
-from estimators.laser.icp import Rules, prepare, register
+from estimators.laser.icp import Rules, better_by, prepare, register
 from experiments.bench.icp import BEARINGS_RAD, SIGMA_RANGE_M, pair
 from experiments.evaluation.scan_bound import cast, fisher_bound, fisher_information
 from sim import se2
@@ -379,3 +379,16 @@ def test_what_the_scans_do_not_hold_stays_as_guessed(seed):
     off = difference(found.T_target_source, motion)
     assert abs(off[2]) < 1e-3
     assert np.hypot(*off[:2]) < 0.01
+
+
+def test_points_bear_out_the_true_pose_and_nothing_along_a_corridor(rng):
+    """By how many points tells a slip of the wheels from a match that wandered."""
+    start, moved, off = np.zeros(3), np.array([0.3, 0.1, 0.05]), np.array([0.2, 0.0, 0.0])
+    noise_m = SIGMA_RANGE_M
+    room, again = scan(ROOM, start, rng), scan(ROOM, moved, rng)
+    assert better_by(again, room, moved, moved + off, noise_m) > 30.0
+    assert better_by(again, room, moved + off, moved, noise_m) < -30.0
+    corridor, along = scan(BARE, start, rng), scan(BARE, np.array([0.3, 0.0, 0.0]), rng)
+    for wrong in (off, -off):
+        at = np.array([0.3, 0.0, 0.0])
+        assert abs(better_by(along, corridor, at + wrong, at, noise_m)) < 1.0
