@@ -24,8 +24,10 @@ from estimators.laser.scan_matching import (
     KeyFrameOptions,
     Match,
     MatcherOptions,
+    bias_sigmas,
     exceeds,
 )
+from estimators.laser.sweep import skew_covariance
 from estimators.wheels import EncoderTickOptions, WheelPrediction
 from sim import se2
 from sim.arrays import Array
@@ -127,6 +129,10 @@ class EkfIcp(EkfIcpOptions):
         # of the twists in map that take the means to the true poses
         to_twist = _from_twist(-start.mean)
         self._covariance = np.tile(to_twist @ start.covariance @ to_twist.T, (3, 3))
+        # derivative of their errors by the laser's biases, which no gain follows (Schmidt 1966)
+        self._by_bias = np.zeros((9, 2))
+        self._biases_m2 = np.diag(np.square(bias_sigmas(self._laser)))
+        self._skew = np.zeros((3, 3))  # of the newest scan, as base_link sees it
         self._old = RememberedPoses(9)
         self._failures = 0
         # a scan whose pose in the key frame was registered, and the key frame's pose in it
@@ -143,14 +149,16 @@ class EkfIcp(EkfIcpOptions):
         if scan is not None and self._is_due():
             prepared = self.matcher.prepare(scan["ranges_m"], self._laser, moved, frame.duration_s)
             self._correct(prepared, extras)
-        by_twist = _from_twist(self._mean[_POSE])
-        covariance = by_twist @ self._covariance[_POSE, _POSE] @ by_twist.T
+        by_twist, by_bias = _from_twist(self._mean[_POSE]), self._by_bias[_POSE]
+        covariance = self._covariance[_POSE, _POSE] + by_bias @ self._biases_m2 @ by_bias.T
+        covariance = by_twist @ covariance @ by_twist.T
         mean = self._mean[_POSE] + self._origin
         return Belief(mean, (covariance + covariance.T) / 2.0, extras)
 
     def _predict(self, frame: Frame) -> Array:
         """Move the robot's pose by the wheels, and return the motion; the clones stay."""
         motion = self._wheels.predict(frame)
+        self._skew = skew_covariance(self._laser, motion.covariance, frame.duration_s)
         self._mean[_POSE], _, by_motion = compose(self._mean[_POSE], motion.mean)
         by_motion = _from_twist(-self._mean[_POSE]) @ by_motion
         self._covariance[_POSE, _POSE] += by_motion @ motion.covariance @ by_motion.T
@@ -273,12 +281,12 @@ class EkfIcp(EkfIcpOptions):
 
         Returns False, with the state as before, if the innovation lies outside the gate.
         """
-        before = self._mean, self._covariance, self._old.factor
+        before = self._mean, self._covariance, self._by_bias, self._old.factor
         shared = self.shared_noise / 2.0 * match.known_covariance
         self._insert(rotate(shared, self._mean[place][2]))
         if taken := self._update(match, place, extras):
             return taken
-        self._mean, self._covariance, self._old.factor = before
+        self._mean, self._covariance, self._by_bias, self._old.factor = before
         return False
 
     def _update(
@@ -309,7 +317,10 @@ class EkfIcp(EkfIcpOptions):
         gain = np.asarray(np.linalg.solve(S, cross.T).T, dtype=np.float64)
         lost = (cross - gain @ (S / 2.0)) @ gain.T
         self._covariance = P - lost - lost.T
-        self._old.learn(by_twist, place, _NEW, S, innovation, gain)
+        off_by_bias = by_twist @ (self._by_bias[_NEW] - self._by_bias[place]) + C @ match.by_bias
+        off_by_bias = np.column_stack([innovation, off_by_bias])
+        self._old.learn(by_twist, place, _NEW, S, off_by_bias, gain)
+        self._by_bias = self._by_bias - gain @ off_by_bias[:, 1:]
         twists = (gain @ innovation).reshape(-1, 3)
         self._mean = se2.compose(se2.exp(twists), self._mean.reshape(-1, 3)).ravel()
         return True
@@ -384,8 +395,10 @@ class EkfIcp(EkfIcpOptions):
     def _insert(self, noise: Array) -> None:
         """Append the newest scan's apparent pose to the state: that of base_link, and noise.
 
-        The noise (3, 3) is in the coordinates of map.
+        The noise (3, 3) is in the coordinates of map. A scan of a laser that sweeps errs besides by
+        what the wheels did during the sweep.
         """
+        noise = noise + rotate(self._skew, self._mean[8])
         to_twist = _from_twist(-self._mean[_POSE])
         self._select(_KEY, _LAST, _POSE, _POSE, slice(9, None))
         self._covariance[_NEW, _NEW] += to_twist @ noise @ to_twist.T
@@ -395,11 +408,14 @@ class EkfIcp(EkfIcpOptions):
         every = np.arange(len(self._mean))
         rows = np.concatenate([every[place] for place in places])
         self._mean, self._covariance = self._mean[rows], self._covariance[np.ix_(rows, rows)]
+        self._by_bias = self._by_bias[rows]
         self._old.select(rows)
 
     def _expand(self) -> None:
         """Append the remembered poses to the state."""
-        self._mean, self._covariance = self._old.join(self._mean, self._covariance)
+        self._mean, self._covariance, self._by_bias = self._old.join(
+            self._mean, self._covariance, self._by_bias
+        )
 
     def _keep(self, key: PreparedScan, last: PreparedScan, places: tuple[slice, slice]) -> None:
         """Keep two of the apparent poses, the robot's, and those of remembered key frames."""
@@ -416,8 +432,9 @@ class EkfIcp(EkfIcpOptions):
         self._remembered = [others[first] for first in kept]
         self._key, self._last = key, last
         self._select(*places, _POSE, *(slice(first, first + 3) for first in kept))
-        self._old = RememberedPoses(9, self._mean, self._covariance)
+        self._old = RememberedPoses(9, self._mean, self._covariance, self._by_bias)
         self._mean, self._covariance = self._mean[:9], self._covariance[:9, :9]
+        self._by_bias = self._by_bias[:9]
 
     def _own_noise(self, scan: PreparedScan) -> Array:
         """Shared noise (3, 3) in map of a scan that was not registered: from one against itself."""

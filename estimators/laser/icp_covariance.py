@@ -28,7 +28,7 @@ from estimators.laser.icp import (
     register,
     split_directions,
 )
-from estimators.laser.icp_iterations import distance
+from estimators.laser.icp_iterations import distance, rotate
 from estimators.laser.scan_lines import Segments
 from sim import se2
 from sim.arrays import Array, Ints
@@ -253,6 +253,41 @@ def misfit(
     return max(squares / counted, 1.0) if counted >= 1.0 else 1.0
 
 
+def by_bias(registration: Registration, source: PreparedScan, target: PreparedScan) -> Array:
+    """Derivative (3, 2) of a registration by a bias of all ranges: by a length, and by a share.
+
+    By a share it is the translation, since all that both scans see grows alike. By a length it is
+    that of point to line, whose lines move where the points on them do.
+    """
+    pose = registration.T_target_source
+    found = np.zeros((3, 2))
+    found[:2, 1] = pose[:2]
+    if registration.metric == "point_to_line" and registration.inliers.any():
+        gradient = _by_length(source, target, pose, registration.matches, registration.weights)
+        found[:, 0] = -_solved_within(registration, gradient)
+    return found
+
+
+@njit(error_model="numpy")
+def _by_length(
+    source: PreparedScan, target: PreparedScan, pose: Array, matches: Ints, weights: Array
+) -> Array:
+    """Derivative (3,) of the gradient of half the cost by a length added to all ranges."""
+    gradient = np.zeros(3)
+    cos, sin = math.cos(pose[2]), math.sin(pose[2])
+    for i in range(len(matches)):
+        if not weights[i] > 0.0:
+            continue
+        qx, qy = rotate(cos, sin, source.points[i, 0], source.points[i, 1])
+        x, y = qx + pose[0], qy + pose[1]
+        _, n1, n2 = distance(target.segments, matches[i], x, y)
+        vx, vy = rotate(cos, sin, source.rays[i, 0], source.rays[i, 1])
+        far = max(math.hypot(x, y), 1e-9)
+        slope = weights[i] * (n1 * (vx - x / far) + n2 * (vy - y / far))
+        gradient += slope * np.array([n1, n2, n2 * qx - n1 * qy])
+    return gradient
+
+
 def hessian(registration: Registration) -> Array:
     """Covariance (3, 3) from the curvature of the cost alone: 2 s^2 (d2J/dx2)^-1.
 
@@ -348,6 +383,15 @@ def _sandwich(
         inverse = np.linalg.inv(A)
         covariance = inverse @ middle @ inverse
     return (covariance + covariance.T) / 2.0
+
+
+def _solved_within(registration: Registration, gradient: Array) -> Array:
+    """A^-1 gradient (3,) within the directions that the scans hold, A of the cost's curvature."""
+    A = registration.normal_matrix
+    if registration.status != "degenerate":
+        return np.asarray(np.linalg.solve(A, gradient))
+    held, _ = split_directions(registration)
+    return np.asarray(held @ np.linalg.solve(held.T @ A @ held, held.T @ gradient))
 
 
 def _widened(covariance: Array, registration: Registration) -> Array:

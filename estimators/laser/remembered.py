@@ -28,19 +28,26 @@ class RememberedPoses:
     ----------
     n_used
         N, at the start of the state.
-    mean, covariance
-        Of all (N + 3 K,); by default there are none but those in use.
+    mean, covariance, by_bias
+        (N + 3 K,) of all, with the derivative (N + 3 K, 2) of their errors by the laser's biases;
+        by default there are none but those in use.
     """
 
     def __init__(
-        self, n_used: int, mean: Array | None = None, covariance: Array | None = None
+        self,
+        n_used: int,
+        mean: Array | None = None,
+        covariance: Array | None = None,
+        by_bias: Array | None = None,
     ) -> None:
-        if mean is None or covariance is None:
+        if mean is None or covariance is None or by_bias is None:
             mean, covariance = np.zeros(n_used), np.zeros((n_used, n_used))
+            by_bias = np.zeros((n_used, 2))
+        self._by_bias = by_bias[n_used:]
         self._mean, self._covariance = mean[n_used:], covariance[n_used:, n_used:]
         self._cross = covariance[:n_used, n_used:]
         self.factor: Array | None = np.eye(n_used)  # of the cross-covariance; None once joined
-        self._lost, self._moved = np.zeros((n_used, n_used)), np.zeros(n_used)
+        self._lost, self._moved = np.zeros((n_used, n_used)), np.zeros((n_used, 3))
 
     def select(self, rows: Ints) -> None:
         """Follow a choice of rows of the poses in use."""
@@ -52,7 +59,8 @@ class RememberedPoses:
     ) -> None:
         """Follow an update (D,) by two poses in use: derivative -H by the first, H by the second.
 
-        S (D, D) is the covariance of the innovation, `gain` (N, D) that of the poses in use.
+        S (D, D) is the covariance of the innovation, `gain` (N, D) that of the poses in use. The
+        innovation (D, 3) has its derivative by the biases beside it.
         """
         if self.factor is None:
             return
@@ -62,16 +70,18 @@ class RememberedPoses:
         self._moved += weighed @ innovation
         self.factor = self.factor - gain @ rows
 
-    def join(self, mean: Array, covariance: Array) -> tuple[Array, Array]:
+    def join(self, mean: Array, covariance: Array, by_bias: Array) -> tuple[Array, Array, Array]:
         """The state of the poses in use with these poses after it, once."""
         if self.factor is None:
-            return mean, covariance
+            return mean, covariance, by_bias
         cross, lost = self.factor @ self._cross, self._cross.T @ self._lost @ self._cross
-        twists = (self._cross.T @ self._moved).reshape(-1, 3)
+        moved = self._cross.T @ self._moved
+        twists = moved[:, 0].reshape(-1, 3)
         old = se2.compose(se2.exp(twists), self._mean.reshape(-1, 3)).ravel()
         self.factor = None
         own = self._covariance - (lost + lost.T) / 2.0
-        return np.append(mean, old), np.block([[covariance, cross], [cross.T, own]])
+        joined = np.block([[covariance, cross], [cross.T, own]])
+        return np.append(mean, old), joined, np.vstack([by_bias, self._by_bias - moved[:, 1:]])
 
 
 @njit(error_model="numpy", fastmath={"contract"})

@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -47,7 +47,7 @@ _LEAST_SIGMA_M = 1e-4  # a laser without noise still has rounding
 # Bounds of the error that a guess is assumed to have
 _LEAST_GATE_M, _MOST_GATE_M = 0.5, 2.0
 _LEAST_GATE_RAD, _MOST_GATE_RAD = 0.02, 0.2
-_EVERYTHING, _NOTHING = np.eye(3), np.zeros((3, 3))
+_EVERYTHING, _NOTHING, _UNBIASED = np.eye(3), np.zeros((3, 3)), np.zeros((3, 2))
 
 
 @dataclass(frozen=True)
@@ -67,6 +67,9 @@ class Match:
         (3, 3) projection onto the directions that the scans do not hold.
     overlap
         Share of the scan's points that agree with the reference.
+    by_bias
+        (3, 2) derivative of the motion by a bias of the ranges, a length and a share; zeros for
+        a laser that is not said to have one.
     """
 
     motion: Gaussian
@@ -74,6 +77,7 @@ class Match:
     held: Array
     loose: Array
     overlap: float
+    by_bias: Array = field(default_factory=lambda: _UNBIASED)
 
     @property
     def failed(self) -> bool:
@@ -97,6 +101,11 @@ class Match:
         unknown = self.motion.covariance - guess.covariance
         covariance = self.motion.covariance - self.loose @ unknown @ self.loose.T
         return Gaussian(self.motion.mean - self.loose @ off, (covariance + covariance.T) / 2.0)
+
+
+def bias_sigmas(laser: Laser) -> tuple[float, float]:
+    """How far all ranges of a laser may be off alike: m, and a share. Which way is not known."""
+    return abs(getattr(laser, "bias_m", 0.0)), abs(getattr(laser, "bias_share", 0.0))
 
 
 def exceeds(motion: Array, distance_m: float, turn_rad: float) -> bool:
@@ -222,13 +231,16 @@ class ScanMatcher:
             found, scan, reference, in_laser.covariance, self.sigma_m(laser), rng
         )
         motion, to_base = Gaussian(found.T_target_source, R).in_sensor(se2.inverse(mount))
+        by_bias = _UNBIASED
+        if any(bias_sigmas(laser)):
+            by_bias = to_base @ icp_covariance.by_bias(found, scan, reference)
         if found.status != "degenerate":
-            return Match(motion, found.status, _EVERYTHING, _NOTHING, found.overlap)
+            return Match(motion, found.status, _EVERYTHING, _NOTHING, found.overlap, by_bias)
         directions = split_directions(found)
         held_in_base, loose_in_base = (to_base @ part for part in directions)
         coordinates = np.linalg.inv(np.hstack([held_in_base, loose_in_base]))
         held, loose = np.split(coordinates, [held_in_base.shape[1]])
-        match = Match(motion, found.status, held, loose_in_base @ loose, found.overlap)
+        match = Match(motion, found.status, held, loose_in_base @ loose, found.overlap, by_bias)
         # The directions themselves are uncertain: along a loose one that is slightly off, the
         # error of the registration and of the guess leaks into the held ones.
         off = loose @ (motion.mean - guess.mean)

@@ -56,3 +56,24 @@ def at_stamp(
     low, high = order[kept][0], order[kept][-1]
     among += step * (np.minimum(order - low, 0) + np.maximum(order - high, 0))
     return ranges, among
+
+
+def skew_covariance(laser: Laser, covariance: Array, duration_s: float) -> Array:
+    """Covariance (3, 3) of where base_link stands off what a scan taken `at_stamp` says of it.
+
+    Parameters
+    ----------
+    covariance, duration_s
+        (3, 3) of the motion over the time before the stamp by which the scan was taken there.
+
+    Notes
+    -----
+    What a motion errs by grows over the time as a random walk; averaged over the beams of a sweep
+    its variance is a third of that at its end. Where the motion is of a shorter time than the
+    sweep, it is extrapolated, and so is its error, half of which remains on average.
+    """
+    sweep_s = -float(laser.beam_offsets_s.min())
+    if sweep_s == 0.0 or not duration_s > 0.0:
+        return np.zeros((3, 3))
+    share = sweep_s / duration_s
+    return np.asarray(max(share / 3.0, (share / 2.0) ** 2) * covariance)

@@ -272,3 +272,27 @@ def test_covariance_turns_with_the_sensor(rng):
     np.testing.assert_allclose(
         icp_covariance.censi(found, *plain, 0.02), 4.0 * icp_covariance.censi(found, *plain, 0.01)
     )
+
+
+@pytest.mark.parametrize("walls", [ROOM, BARE])
+def test_the_derivative_by_a_bias_is_that_of_registrations_of_biased_scans(walls):
+    """By 2 cm, and by 1 % of the range; along a corridor nothing is said."""
+    at, ahead = np.array([0.3, 0.2, 0.1]), np.array([0.5, 0.15, 0.2])
+    true = se2.between(at, ahead)
+
+    def scans(length_m, share):
+        return [
+            prepare(
+                (1.0 + share) * cast(walls, pose, BEARINGS_RAD)[0] + length_m, BEARINGS_RAD, 80.0
+            )
+            for pose in (ahead, at)
+        ]
+
+    source, target = scans(0.0, 0.0)
+    found = register(source, target, true)
+    slopes = icp_covariance.by_bias(found, source, target)
+    for column, (length_m, share) in enumerate([(0.02, 0.0), (0.0, 0.01)]):
+        off = register(*scans(length_m, share), true).T_target_source - found.T_target_source
+        expected = slopes[:, column] * (length_m + share)
+        held = found.status == "ok"
+        assert np.abs(off - expected)[1 - held :].max() < 0.25 * np.abs(off).max() + 1e-4, column

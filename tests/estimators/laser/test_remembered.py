@@ -20,26 +20,33 @@ def test_what_is_learnt_later_is_what_a_whole_update_learns(rng):
     root = 0.01 * rng.standard_normal((n + old, n + old))
     mean, P = rng.standard_normal(n + old), root @ root.T
     used, joint_mean, joint = P[:n, :n], mean.copy(), P.copy()
-    remembered = RememberedPoses(n, mean, P)
+    by_bias = rng.standard_normal((n + old, 2))
+    joint_by_bias, used_by_bias = by_bias.copy(), by_bias[:n]
+    remembered = RememberedPoses(n, mean, P, by_bias)
     for _ in range(3):
         first, second = slice(0, 3), slice(6, 9)
         H, noise = rng.standard_normal((2, 3)), 1e-6 * np.eye(2)
         innovation = 1e-4 * rng.standard_normal(2)
         whole = np.zeros((2, n + old))
         whole[:, first], whole[:, second] = -H, H
+        slopes = whole @ joint_by_bias + rng.standard_normal((2, 2))
+        whole_gain = joint @ whole.T @ np.linalg.inv(whole @ joint @ whole.T + noise)
+        joint_by_bias = joint_by_bias - whole_gain @ slopes
         twists, joint = update(np.zeros(n + old), joint, innovation, whole, noise)
         moved = se2.compose(se2.exp(twists.reshape(-1, 3)), joint_mean.reshape(-1, 3))
         joint_mean = moved.ravel()
         rows = whole[:, :n]
         S = rows @ used @ rows.T + noise
         gain = np.linalg.solve(S, rows @ used).T
-        remembered.learn(H, first, second, S, innovation, gain)
+        remembered.learn(H, first, second, S, np.column_stack([innovation, slopes]), gain)
+        used_by_bias = used_by_bias - gain @ slopes
         used = used - gain @ rows @ used
-    found_mean, found = remembered.join(joint_mean[:n], used)
+    found_mean, found, found_by_bias = remembered.join(joint_mean[:n], used, used_by_bias)
+    np.testing.assert_allclose(found_by_bias, joint_by_bias, atol=1e-10)
     np.testing.assert_allclose(found, joint, atol=1e-12)
     off = se2.difference(found_mean.reshape(-1, 3), joint_mean.reshape(-1, 3))
     np.testing.assert_allclose(off, 0.0, atol=1e-6)  # twists are added up, not composed
-    again = remembered.join(found_mean, found)  # once is enough
+    again = remembered.join(found_mean, found, found_by_bias)  # once is enough
     assert again[0] is found_mean
 
 

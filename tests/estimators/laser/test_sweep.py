@@ -3,10 +3,13 @@
 import numpy as np
 import pytest
 
+from estimators.base import run
 from estimators.gaussian import Gaussian
 from estimators.laser.ekf_icp import EkfIcp
 from estimators.laser.sweep import at_stamp
+from experiments.evaluation.metrics import nees
 from experiments.evaluation.scan_bound import cast
+from experiments.runs.experiment import Experiment
 from sim import se2
 from sim.sensors import Laser, Mount
 from tests.estimators.laser.test_icp import ROOM
@@ -63,3 +66,21 @@ def test_a_turn_during_the_sweep_does_not_turn_the_motion():
     assert found.status == "ok"
     assert abs(found.motion.mean[2] - MOVED[2]) < 2e-3
     assert np.hypot(*(found.motion.mean - MOVED)[:2]) < 0.01
+
+
+@pytest.mark.parametrize(("fault", "informed"), [("bias_share=0.005", 4.0), ("sweep_s=0.09", 4.0)])
+def test_the_filter_knows_what_real_lasers_do_to_it(fault, informed):
+    """Ranges that are all off alike, and a sweep during which the wheels slip."""
+    squares = []
+    for seed in (0, 1):
+        experiment = Experiment.compose(
+            f"world=rooms robot=robocom route.distance_m=20 seed={seed} sensors=hokuyo "
+            "sensors.laser._target_=sim.sensors.real_laser.RealLaser sensors.laser.rate_hz=10 "
+            f"+sensors.laser.{fault} simulation.physics=kinematic estimator=ekf_icp".split()
+        )
+        recording = experiment.simulate()
+        prior = experiment.prior(recording)
+        path = run(experiment.estimator(), recording, prior, np.random.default_rng(0))
+        truth = recording.truth_at(path.stamps)
+        squares.append(np.nanmean(nees(truth, path.means, path.covariances)) / 3.0)
+    assert np.mean(squares) < informed, squares
