@@ -69,7 +69,7 @@ def skew_covariance(laser: Laser, covariance: Array, duration_s: float) -> Array
     Notes
     -----
     What a motion errs by grows over the time as a random walk; averaged over the beams of a sweep
-    its variance is a third of that at its end. Where the motion is of a shorter time than the
+    its variance is a third of that at its end. Where the motion covers a shorter time than the
     sweep, it is extrapolated, and so is its error, half of which remains on average.
     """
     sweep_s = -float(laser.beam_offsets_s.min())
