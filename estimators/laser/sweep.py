@@ -72,8 +72,7 @@ def skew_covariance(laser: Laser, covariance: Array, duration_s: float) -> Array
     its variance is a third of that at its end. Where the motion covers a shorter time than the
     sweep, it is extrapolated, and so is its error, half of which remains on average.
     """
-    sweep_s = -float(laser.beam_offsets_s.min())
-    if sweep_s == 0.0 or not duration_s > 0.0:
+    if laser.sweep_s == 0.0 or not duration_s > 0.0:
         return np.zeros((3, 3))
-    share = sweep_s / duration_s
+    share = -float(laser.beam_offsets_s.min()) / duration_s
     return np.asarray(max(share / 3.0, (share / 2.0) ** 2) * covariance)

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.spatial import KDTree
 
-from estimators.gaussian import STILL, Gaussian
+from estimators.gaussian import STILL, Gaussian, rotate
 from estimators.on_a_map.likelihood_field import LikelihoodField
 from estimators.on_a_map.walls import Nearest
 from sim import se2
@@ -155,10 +155,7 @@ class WallFit:
         sweep_s = float(np.max(self._ages_s))
         known = [guess.covariance, self._bias_covariance]
         if sweep_s > 0.0:
-            turn = np.eye(3)
-            cos, sin = math.cos(guess.mean[2]), math.sin(guess.mean[2])
-            turn[:2, :2] = [[cos, -sin], [sin, cos]]
-            known.append(turn @ slip_per_s @ turn.T / sweep_s)
+            known.append(rotate(slip_per_s, guess.mean[2]) / sweep_s)
         inverted = [np.linalg.inv(each + 1e-12 * np.eye(len(each))) for each in known]
         return np.asarray(block_diag(*inverted))
 
