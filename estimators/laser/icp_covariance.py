@@ -264,7 +264,7 @@ def by_bias(registration: Registration, source: PreparedScan, target: PreparedSc
     found[:2, 1] = pose[:2]
     if registration.metric == "point_to_line" and registration.inliers.any():
         gradient = _by_length(source, target, pose, registration.matches, registration.weights)
-        found[:, 0] = -_solved_within(registration, gradient)
+        found[:, 0] = -_inverse_within(registration.normal_matrix, registration) @ gradient
     return found
 
 
@@ -375,23 +375,20 @@ def _sandwich(
     A: Array, middle: Array, registration: Registration, *, everywhere: bool = False
 ) -> Array:
     """A^-1 middle A^-1 within the directions that the scans hold; the rest, else, is unknown."""
-    if registration.status == "degenerate" and not everywhere:
-        held, loose = split_directions(registration)
-        gain = held @ np.linalg.solve(held.T @ A @ held, held.T)
-        covariance: Array = gain @ middle @ gain.T + loose @ loose.T
-    else:
-        inverse = np.linalg.inv(A)
-        covariance = inverse @ middle @ inverse
+    held = None if everywhere else registration
+    gain = _inverse_within(A, held)
+    covariance = gain @ middle @ gain  # the inverse of what is symmetric is
+    if held is not None:
+        covariance = _widened(covariance, held)
     return (covariance + covariance.T) / 2.0
 
 
-def _solved_within(registration: Registration, gradient: Array) -> Array:
-    """A^-1 gradient (3,) within the directions that the scans hold, A of the cost's curvature."""
-    A = registration.normal_matrix
-    if registration.status != "degenerate":
-        return np.asarray(np.linalg.solve(A, gradient))
+def _inverse_within(A: Array, registration: Registration | None) -> Array:
+    """A^-1 (3, 3) within the directions that the scans of a registration hold; None: in all."""
+    if registration is None or registration.status != "degenerate":
+        return np.linalg.inv(A)
     held, _ = split_directions(registration)
-    return np.asarray(held @ np.linalg.solve(held.T @ A @ held, held.T @ gradient))
+    return np.asarray(held @ np.linalg.solve(held.T @ A @ held, held.T))
 
 
 def _widened(covariance: Array, registration: Registration) -> Array:

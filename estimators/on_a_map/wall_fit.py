@@ -169,12 +169,15 @@ def _lines_of(walls: Array) -> Array:
 
 def _lines_of_cells(middles: Array, cell_m: float) -> Array:
     """Lines (W, 5) through occupied cells (W, 2), by total least squares of those about each."""
-    normals, through = np.empty_like(middles), np.empty_like(middles)
-    tree = KDTree(middles)
-    for i, near in enumerate(tree.query_ball_point(middles, (_NEIGHBOURS + 0.01) * cell_m)):
-        through[i] = middles[near].mean(axis=0)
-        off = middles[near] - through[i]
-        normals[i] = np.linalg.eigh(off.T @ off)[1][:, 0]
+    pairs = KDTree(middles).query_pairs((_NEIGHBOURS + 0.01) * cell_m, output_type="ndarray")
+    to = np.concatenate([np.arange(len(middles)), pairs[:, 0], pairs[:, 1]])
+    near = middles[np.concatenate([np.arange(len(middles)), pairs[:, 1], pairs[:, 0]])]
+    counts = np.bincount(to)
+    through = np.stack([np.bincount(to, part) / counts for part in near.T], axis=1)
+    x, y = (near - through[to]).T
+    xx, xy, yy = (np.bincount(to, part) for part in (x * x, x * y, y * y))
+    direction_rad = np.arctan2(2.0 * xy, xx - yy) / 2.0
+    normals = np.stack([-np.sin(direction_rad), np.cos(direction_rad)], axis=1)
     along = np.stack([-normals[:, 1], normals[:, 0]], axis=1)
     feet = through + np.sum((middles - through) * along, axis=1)[:, None] * along
     return _lines(normals, feet - cell_m * along, feet + cell_m * along)
@@ -258,7 +261,8 @@ def _fit(
                 for j in range(i + 1):
                     A[i, j] += weight * slope[i] * slope[j]
             block = b * _BLOCKS // n_beams
-            sums[block] += weight * residual
+            # outwards, whichever side of its wall a line's normal points to
+            sums[block] += math.copysign(weight, across) * residual
             weights[block] += weight
         if n < _MIN_BEAMS:
             break
