@@ -220,6 +220,8 @@ class Mcl(MclOptions):
             else:
                 self._weigh(ends)
         now = self._belief.then(self._motion)
+        if self._wall_fit is not None:
+            self._wall_fit.roll(rolled)
         if scan is not None:
             slip = rolled.covariance / max(frame.duration_s, 1e-9)
             self._fitted = self._fit(now, ranges_m, bearings_rad, slip, learn=is_due)

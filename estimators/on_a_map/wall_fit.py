@@ -16,7 +16,7 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.spatial import KDTree
 
-from estimators.gaussian import STILL, Gaussian, rotate
+from estimators.gaussian import STILL, Gaussian, compose, rotate
 from estimators.on_a_map.likelihood_field import LikelihoodField
 from estimators.on_a_map.walls import Nearest
 from sim import se2
@@ -73,6 +73,9 @@ class WallFit:
     what a scan says of it is known to the next. So is, of a laser that sweeps, by how much the
     robot moved otherwise during the sweep than the wheels say.
 
+    Where the walls are exact, the pose that was fitted is the next scan's guess, taken there by
+    the wheels: the errors of scans are independent. Those of a grid's cells are not.
+
     Parameters
     ----------
     field
@@ -83,6 +86,7 @@ class WallFit:
         self, field: LikelihoodField, known_map: World | OccupancyGrid, laser: Laser
     ) -> None:
         self._laser, self._cell_sigma_m = laser, 0.0
+        self._exact, self._fitted = isinstance(known_map, World), False
         if isinstance(known_map, OccupancyGrid):
             lines = _lines_of_cells(field.walls[:, :2], known_map.resolution_m)
             self._cell_sigma_m = known_map.resolution_m / math.sqrt(12.0)
@@ -90,7 +94,19 @@ class WallFit:
             lines = _lines_of(field.walls)
         self._walls = _Walls(lines, field.nearest, field.origin_m, field.cell_m)
         self._ages_s = -laser.beam_offsets_s
-        self._bias, self._bias_covariance = np.zeros(2), np.diag(np.square(_BIAS_SIGMAS))
+        # of the pose, while it is fitted, and the biases
+        self._state = np.zeros(5)
+        self._covariance = np.diag(np.square([0.0, 0.0, 0.0, *_BIAS_SIGMAS]))
+
+    def roll(self, motion: Gaussian) -> None:
+        """Take the pose that was fitted on by the wheels."""
+        if not self._fitted:
+            return
+        pose, by_pose, by_motion = compose(self._state[:3], motion.mean)
+        by_state = np.asarray(block_diag(by_pose, np.eye(2)))
+        self._state = np.append(pose, self._state[3:])
+        self._covariance = by_state @ self._covariance @ by_state.T
+        self._covariance[:3, :3] += by_motion @ motion.covariance @ by_motion.T
 
     def fit(
         self,
@@ -113,8 +129,8 @@ class WallFit:
         slip_per_s
             (3, 3) variance of the wheels' motion in a second.
         learn
-            Whether the next scan knows what this one says of the laser's bias: not if it is taken
-            at the same place, where the map errs alike.
+            Whether the next scan knows what this one says of the laser's bias by a grid: not if it
+            is taken at the same place, where the map errs alike.
 
         Returns
         -------
@@ -127,37 +143,60 @@ class WallFit:
         x, y, yaw = self._laser.mount.pose
         turn = np.array([[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]])
         sigma_m = max(self._laser.sigma_range_m, _LEAST_SIGMA_M)
-        prior = self._prior(guess, slip_per_s)
         beams = _Beams(ranges_m[seen], turn @ rays, self._ages_s[seen], np.array([x, y]))
         noise = _Noise(
             sigma_m,
             math.hypot(_FLOOR * sigma_m, _CELL_FLOOR * self._cell_sigma_m),
             len(beams.ages_s) / _BLOCKS * self._cell_sigma_m**2,
         )
-        known = np.concatenate([guess.mean, self._bias])
-        moved, information, n, misfit = _fit(known, prior, beams, self._walls, noise)
+        fitted = None
+        if self._fitted and _mahalanobis(self._state[:3], guess) < _MAX_MAHALANOBIS:
+            fitted = self._moved(self._state, self._covariance, beams, noise, slip_per_s)
+        if fitted is None:
+            state = np.append(guess.mean, self._state[3:])
+            covariance = np.asarray(block_diag(guess.covariance, self._covariance[3:, 3:]))
+            fitted = self._moved(state, covariance, beams, noise, slip_per_s)
+        self._fitted = self._exact and fitted is not None
+        if fitted is None:
+            return None
+        if self._exact or learn:
+            self._state, self._covariance = fitted
+        mean, covariance = fitted
+        rest = _RANDOM_WALK * float(np.max(self._ages_s)) * slip_per_s
+        return Gaussian(mean[:3], covariance[:3, :3]).then(Gaussian(STILL.mean, rest))
+
+    def _moved(
+        self, state: Array, covariance: Array, beams: _Beams, noise: _Noise, slip_per_s: Array
+    ) -> tuple[Array, Array] | None:
+        """A state (5,) as the beams correct it, and its covariance; None if they do not fit."""
+        prior = self._prior(state, covariance, slip_per_s)
+        moved, information, n, misfit = _fit(state, prior, beams, self._walls, noise)
         if n < max(_MIN_BEAMS, _MIN_SHARE * len(beams.ages_s)):
             return None
         if moved @ prior @ moved > _MAX_MAHALANOBIS:
             return None
-        mean = guess.mean + moved[:3]
+        mean = state + moved[:5]
         mean[2] = se2.wrap(mean[2])
-        covariance = np.linalg.inv(information) * max(misfit, 1.0)
-        covariance = (covariance + covariance.T) / 2.0
-        if learn:
-            self._bias = self._bias + moved[3:5]
-            self._bias_covariance = covariance[3:5, 3:5]
-        rest = _RANDOM_WALK * float(np.max(self._ages_s)) * slip_per_s
-        return Gaussian(mean, covariance[:3, :3]).then(Gaussian(STILL.mean, rest))
+        found = (np.linalg.inv(information) * max(misfit, 1.0))[:5, :5]
+        return mean, (found + found.T) / 2.0
 
-    def _prior(self, guess: Gaussian, slip_per_s: Array) -> Array:
+    def _prior(self, state: Array, covariance: Array, slip_per_s: Array) -> Array:
         """Information (5, 5), or (8, 8) of a laser that sweeps: pose, biases, velocity in map."""
         sweep_s = float(np.max(self._ages_s))
-        known = [guess.covariance, self._bias_covariance]
+        known = [covariance]
         if sweep_s > 0.0:
-            known.append(rotate(slip_per_s, guess.mean[2]) / sweep_s)
-        inverted = [np.linalg.inv(each + 1e-12 * np.eye(len(each))) for each in known]
-        return np.asarray(block_diag(*inverted))
+            known.append(rotate(slip_per_s, state[2]) / sweep_s)
+        return np.asarray(block_diag(*(_inverse(each) for each in known)))
+
+
+def _mahalanobis(pose: Array, guess: Gaussian) -> float:
+    off = se2.difference(pose, guess.mean)
+    return float(off @ _inverse(guess.covariance) @ off)
+
+
+def _inverse(covariance: Array) -> Array:
+    """Also of what is known exactly."""
+    return np.asarray(np.linalg.inv(covariance + 1e-12 * np.eye(len(covariance))))
 
 
 def _lines_of(walls: Array) -> Array:
