@@ -13,7 +13,6 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import block_diag
 from scipy.spatial import KDTree
 
 from estimators.gaussian import STILL, Gaussian, compose, rotate
@@ -103,9 +102,9 @@ class WallFit:
         if not self._fitted:
             return
         pose, by_pose, by_motion = compose(self._state[:3], motion.mean)
-        by_state = np.asarray(block_diag(by_pose, np.eye(2)))
-        self._state = np.append(pose, self._state[3:])
-        self._covariance = by_state @ self._covariance @ by_state.T
+        self._state = np.concatenate([pose, self._state[3:]])
+        self._covariance[:3] = by_pose @ self._covariance[:3]
+        self._covariance[:, :3] = self._covariance[:, :3] @ by_pose.T
         self._covariance[:3, :3] += by_motion @ motion.covariance @ by_motion.T
 
     def fit(
@@ -153,8 +152,8 @@ class WallFit:
         if self._fitted and _mahalanobis(self._state[:3], guess) < _MAX_MAHALANOBIS:
             fitted = self._moved(self._state, self._covariance, beams, noise, slip_per_s)
         if fitted is None:
-            state = np.append(guess.mean, self._state[3:])
-            covariance = np.asarray(block_diag(guess.covariance, self._covariance[3:, 3:]))
+            state = np.concatenate([guess.mean, self._state[3:]])
+            covariance = _block_diagonal(guess.covariance, self._covariance[3:, 3:])
             fitted = self._moved(state, covariance, beams, noise, slip_per_s)
         self._fitted = self._exact and fitted is not None
         if fitted is None:
@@ -183,15 +182,22 @@ class WallFit:
     def _prior(self, state: Array, covariance: Array, slip_per_s: Array) -> Array:
         """Information (5, 5), or (8, 8) of a laser that sweeps: pose, biases, velocity in map."""
         sweep_s = float(np.max(self._ages_s))
-        known = [covariance]
-        if sweep_s > 0.0:
-            known.append(rotate(slip_per_s, state[2]) / sweep_s)
-        return np.asarray(block_diag(*(_inverse(each) for each in known)))
+        if sweep_s == 0.0:
+            return _inverse(covariance)
+        velocity = rotate(slip_per_s, state[2]) / sweep_s
+        return _block_diagonal(_inverse(covariance), _inverse(velocity))
 
 
 def _mahalanobis(pose: Array, guess: Gaussian) -> float:
     off = se2.difference(pose, guess.mean)
     return float(off @ _inverse(guess.covariance) @ off)
+
+
+def _block_diagonal(first: Array, second: Array) -> Array:
+    n = len(first)
+    both = np.zeros((n + len(second), n + len(second)))
+    both[:n, :n], both[n:, n:] = first, second
+    return both
 
 
 def _inverse(covariance: Array) -> Array:

@@ -24,6 +24,8 @@ from sim.recording import Recording
 OFF = np.array([2.0, 2.0, 1.0])  # of a misread start, m, m, rad
 LIFTED = (0.4, 0.5)  # share of the drive
 PLANTED = ("nothing", "start", "wheels")
+_FEWER, _QUIET = "seed=range(1000,1004)", "study=self_knowledge_quiet"
+_FIRST_QUIET = 10_000  # seed
 
 
 def run(profile: Profile, out: Results, on_progress: Progress) -> None:
@@ -32,11 +34,14 @@ def run(profile: Profile, out: Results, on_progress: Progress) -> None:
     Parameters
     ----------
     profile
-        `quick`: 4 drives of each method; `full`: 250 of `mcl`, 60 of the others.
+        `quick`: 4 drives of each method; `full`: 250 of `mcl`, 60 of the others, and 800 longer
+        ones of `mcl` in which nothing is planted.
     """
-    fewer = [] if profile is Profile.FULL else ["seed=range(1000,1004)"]
-    runs = plan_experiments(["study=self_knowledge", *fewer])
-    jobs = [[part] for part in group_by(runs, lambda one: one.seed)]
+    is_full = profile is Profile.FULL
+    runs = plan_experiments(["study=self_knowledge", *([] if is_full else [_FEWER])])
+    jobs: list[list[object]] = [[part] for part in group_by(runs, lambda one: one.seed)]
+    if is_full:
+        jobs += [[[one], PLANTED[:1]] for one in plan_experiments([_QUIET])]
     made = tables_of(said, jobs, on_progress)
     out.write_tables(**made, curve=curves(made["said"]))
 
@@ -46,7 +51,9 @@ REMADE = {"said": 60.0}  # the curves follow from them
 
 def remake(_table: str, row: Cells) -> Remake:
     """The call that makes a row again."""
-    runs = plan_experiments(["study=self_knowledge", f"seed={row['seed']:.0f}"])
+    seed = f"seed={row['seed']:.0f}"
+    study = _QUIET if row["seed"] >= _FIRST_QUIET else "study=self_knowledge"
+    runs = plan_experiments([study, seed])
     own = [one for one in runs if one.estimator_name == row["method"]]
     return said, (own, [str(row["planted"])])
 
