@@ -386,7 +386,7 @@ def _sandwich(
 def _inverse_within(A: Array, registration: Registration | None) -> Array:
     """A^-1 (3, 3) within the directions that the scans of a registration hold; None: in all."""
     if registration is None or registration.status != "degenerate":
-        return np.linalg.inv(A)
+        return np.asarray(np.linalg.inv(A))
     held, _ = split_directions(registration)
     return np.asarray(held @ np.linalg.solve(held.T @ A @ held, held.T))
 

@@ -86,6 +86,7 @@ class WallFit:
     ) -> None:
         self._laser, self._cell_sigma_m = laser, 0.0
         self._exact, self._fitted = isinstance(known_map, World), False
+        self._turn_rad = 0.0  # in the last Frame
         if isinstance(known_map, OccupancyGrid):
             lines = _lines_of_cells(field.walls[:, :2], known_map.resolution_m)
             self._cell_sigma_m = known_map.resolution_m / math.sqrt(12.0)
@@ -98,9 +99,18 @@ class WallFit:
         self._covariance = np.diag(np.square([0.0, 0.0, 0.0, *_BIAS_SIGMAS]))
 
     def roll(self, motion: Gaussian) -> None:
-        """Take the pose that was fitted on by the wheels."""
+        """Take the pose that was fitted on by the wheels.
+
+        They say how far the robot turned in a Frame, not when in it: sideways that leaves the slip
+        within the Frame, and how the turn has changed since the Frame before.
+        """
+        length_m, _, turn_rad = motion.mean
+        unsteady_rad2 = motion.covariance[2, 2] / 12.0 + ((turn_rad - self._turn_rad) / 6.0) ** 2
+        self._turn_rad = turn_rad
         if not self._fitted:
             return
+        motion = Gaussian(motion.mean, motion.covariance.copy())
+        motion.covariance[1, 1] += length_m**2 * unsteady_rad2
         pose, by_pose, by_motion = compose(self._state[:3], motion.mean)
         self._state = np.concatenate([pose, self._state[3:]])
         self._covariance[:3] = by_pose @ self._covariance[:3]

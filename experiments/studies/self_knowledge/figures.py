@@ -1,16 +1,26 @@
-"""Figure of the study of self-knowledge."""
+"""Figures of the study of self-knowledge."""
 
+import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
 from experiments.judging.results import Results
+from experiments.studies.self_knowledge.planted import LIFTED
 from experiments.viewing.plotting import with_legend
 from experiments.viewing.style import SERIES, subplots
 
+_CONSISTENT = 0.90, 0.99  # share inside the ellipsoid of 95 % that passes
+
 
 def draw(results: Results) -> dict[str, Figure]:
-    """Draw the study's figure."""
-    return {"self_knowledge_alarms": draw_alarms(results.table("curve"))}
+    """Draw the study's figures."""
+    drawn = {"self_knowledge_alarms": draw_alarms(results.table("curve"))}
+    coverage, wean = (results.optional_table(name) for name in ("coverage", "wean"))
+    if coverage is not None:
+        drawn["self_knowledge_coverage"] = draw_coverage(coverage)
+    if wean is not None:
+        drawn["self_knowledge_wean"] = draw_wean(wean, results.table("curve"))
+    return drawn
 
 
 def draw_alarms(table: pd.DataFrame) -> Figure:
@@ -26,3 +36,37 @@ def draw_alarms(table: pd.DataFrame) -> Figure:
     axes.set_xticks([0.0, 1.0, 10.0, 100.0], ["0", "1", "10", "100"])
     axes.set(xlabel="false alarms an hour", ylabel="share of losses missed", ylim=(-0.02, 1.02))
     return with_legend(page, ncols=2)
+
+
+def draw_coverage(table: pd.DataFrame) -> Figure:
+    """Share of poses inside the 95 % ellipsoid, a row a method and answer."""
+    ordered = table.sort_values("inside_95_share", ignore_index=True)
+    page, axes = subplots(6.5, 0.9 + 0.28 * len(ordered), 1, 1)
+    axes.axvspan(*_CONSISTENT, color="#dddddd", lw=0)
+    axes.axvline(0.95, color="#999999", lw=0.8, ls=":")
+    reach = np.abs(ordered[["low", "high"]].to_numpy().T - ordered["inside_95_share"].to_numpy())
+    axes.errorbar(ordered["inside_95_share"], ordered.index, xerr=reach, fmt="o", ms=4, lw=1.0)
+    names = [
+        row.method if row.answer == "online" else f"{row.method} ({row.answer})"
+        for row in ordered.itertuples()
+    ]
+    axes.set_yticks(ordered.index, names)
+    axes.set(xlabel="share of poses inside the 95 % ellipsoid", xlim=(-0.02, 1.02))
+    return page
+
+
+def draw_wean(table: pd.DataFrame, curve: pd.DataFrame) -> Figure:
+    """What `mcl` says over a real log, as logged and with wheels that are lifted."""
+    page, (above, below) = subplots(6.5, 4.2, 2, 1, sharex=True)
+    time_s, (logged, _), (lifted, _) = table["stamp_s"], *SERIES[:2]
+    above.plot(time_s, table["apart_m"], color=lifted)
+    above.set(ylabel="distance between\nthe two paths, m", ylim=(0.0, None))
+    below.plot(time_s, table["lost_lifted"], color=lifted, lw=0.8, label="with wheels lifted")
+    below.plot(time_s, table["lost"], color=logged, lw=0.8, label="as logged")
+    own = curve[(curve["method"] == "mcl") & (curve["false_per_h"] <= 1.0)]
+    threshold = own["threshold"].min()
+    below.axhline(threshold, color="#999999", lw=0.8, ls=":", label="one false alarm an hour")
+    for axes in (above, below):
+        axes.axvspan(*np.quantile(time_s, LIFTED), color="#eeeeee", lw=0)
+    below.set(xlabel="time, s", ylabel="lost", ylim=(0.0, 1.02))
+    return with_legend(page, ncols=3)

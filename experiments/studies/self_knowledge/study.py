@@ -1,16 +1,20 @@
-"""Do methods notice that they are lost? Alarms over drives as they are, and over planted losses.
+"""Do methods know their error, and notice that they are lost? Over drives as they are, and planted.
 
 Planted are a start misread by metres and a radian, and wheels lifted on the way, whose encoders
 stand while the robot goes on.
 """
 
 import dataclasses
+import math
 from collections.abc import Sequence
 
 import numpy as np
 import pandas as pd
 
+from estimators.base import Estimate
 from experiments.evaluation.alarm import Evidence, alarm_curve, evidence_of
+from experiments.evaluation.metrics import score
+from experiments.evaluation.statistics import bootstrap_interval
 from experiments.judging.jobs import Progress, Tables, group_by, tables_of
 from experiments.judging.remake import Cells, Remake
 from experiments.judging.results import Profile, Results
@@ -18,18 +22,31 @@ from experiments.runs.evaluate import run_over
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Row
 from experiments.runs.seeds import stream
+from experiments.studies.self_knowledge.planted import lift_wheels
+from experiments.studies.self_knowledge.wean import over_wean
 from experiments.sweeps.plan import plan_experiments
 from sim.recording import Recording
 
 OFF = np.array([2.0, 2.0, 1.0])  # of a misread start, m, m, rad
-LIFTED = (0.4, 0.5)  # share of the drive
 PLANTED = ("nothing", "start", "wheels")
 _FEWER, _QUIET = "seed=range(1000,1004)", "study=self_knowledge_quiet"
 _FIRST_QUIET = 10_000  # seed
+_SCORES = (
+    "ate_rmse_m",
+    "heading_rmse_rad",
+    "nees_mean",
+    "inside_50_share",
+    "inside_90_share",
+    "inside_95_share",
+    "sharpness_m",
+)
 
 
 def run(profile: Profile, out: Results, on_progress: Progress) -> None:
-    """Run the study and write its tables: what each method said, and its curve of alarms.
+    """Run the study and write its tables.
+
+    They are: what each method said in losses and without one, and its curve of alarms; of each
+    drive in which nothing is planted how it knew its error, and the means of that.
 
     Parameters
     ----------
@@ -43,10 +60,12 @@ def run(profile: Profile, out: Results, on_progress: Progress) -> None:
     if is_full:
         jobs += [[[one], PLANTED[:1]] for one in plan_experiments([_QUIET])]
     made = tables_of(said, jobs, on_progress)
-    out.write_tables(**made, curve=curves(made["said"]))
+    curve, coverage = curves(made["said"]), covered(made["consistency"])
+    out.write_tables(**made, curve=curve, coverage=coverage)
 
 
-REMADE = {"said": 60.0}  # the curves follow from them
+PARTS = {"wean": over_wean}
+REMADE = {"said": 60.0, "consistency": 60.0}  # the others follow from them
 
 
 def remake(_table: str, row: Cells) -> Remake:
@@ -55,24 +74,19 @@ def remake(_table: str, row: Cells) -> Remake:
     study = _QUIET if row["seed"] >= _FIRST_QUIET else "study=self_knowledge"
     runs = plan_experiments([study, seed])
     own = [one for one in runs if one.estimator_name == row["method"]]
-    return said, (own, [str(row["planted"])])
-
-
-def lift_wheels(recording: Recording) -> Recording:
-    """The recording with encoders that stand for a part of the drive."""
-    wheels = recording.wheels
-    ends = np.quantile(wheels.stamps, LIFTED)
-    begin_m, end_m = wheels.at(ends)
-    before, after = (wheels.stamps < ends[0])[:, None], (wheels.stamps > ends[1])[:, None]
-    stands = np.where(after, wheels.position_m - end_m + begin_m, begin_m)
-    position_m = np.where(before, wheels.position_m, stands)
-    return dataclasses.replace(recording, wheels=dataclasses.replace(wheels, position_m=position_m))
+    return said, (own, [str(row.get("planted", PLANTED[0]))])
 
 
 def said(runs: Sequence[Experiment], planted: Sequence[str] = PLANTED) -> Tables:
-    """What each run over one recording said, in losses and in quiet windows."""
+    """What each run over one recording said, in losses and in quiet windows; how it knew its error.
+
+    Returns
+    -------
+    Tables
+        `said`, a row a loss or window, and `consistency`, a row an answer in a drive as it is.
+    """
     recording = runs[0].recording()
-    truth, rows = recording.truth_at(recording.frame_stamps), list[Row]()
+    truth, rows, known = recording.truth_at(recording.frame_stamps), list[Row](), list[Row]()
     for one in runs:
         for what in planted:
             prior = one.prior(recording)
@@ -80,7 +94,7 @@ def said(runs: Sequence[Experiment], planted: Sequence[str] = PLANTED) -> Tables
                 prior = dataclasses.replace(prior, mean=prior.mean + OFF)
             driven = lift_wheels(recording) if what == "wheels" else recording
             rng = stream(one.seed, f"estimator/{one.estimator_name}/{what}")
-            online, _ = run_over(driven, one.estimator(), prior, rng, ("lost",))
+            online, revised = run_over(driven, one.estimator(), prior, rng, ("lost",))
             labels: Row = {"method": one.estimator_name, "planted": what, "seed": one.seed}
             kinds = evidence_of(truth, online)._asdict()
             rows += [
@@ -88,7 +102,33 @@ def said(runs: Sequence[Experiment], planted: Sequence[str] = PLANTED) -> Tables
                 for kind, values in kinds.items()
                 for number, value in enumerate(values)
             ]
-    return {"said": rows}
+            if what == PLANTED[0]:
+                known += [
+                    consistency(recording, answer, labels) for answer in (online, revised) if answer
+                ]
+    return {"said": rows, "consistency": known}
+
+
+def consistency(recording: Recording, answer: Estimate, labels: Row) -> Row:
+    """How an answer knew its error over a drive."""
+    scores = score(recording, answer)
+    return {**labels, "answer": answer.kind, **{key: scores.get(key, math.nan) for key in _SCORES}}
+
+
+def covered(table: pd.DataFrame) -> pd.DataFrame:
+    """Means of the scores of `consistency` by method and answer, over drives of one length.
+
+    The interval of the share inside 95 % is the bootstrap over drives.
+    """
+    rows = list[Row]()
+    usual = table[table["seed"] < _FIRST_QUIET]
+    for (method, answer), own in usual.dropna().groupby(["method", "answer"]):
+        inside = own["inside_95_share"].to_numpy(float)
+        of = bootstrap_interval(inside, lambda a: float(a.mean()), np.random.default_rng(0))
+        labels: Row = {"method": method, "answer": answer, "drives": len(own)}
+        means = {key: float(own[key].mean()) for key in _SCORES}
+        rows.append({**labels, **means, "low": of.low, "high": of.high})
+    return pd.DataFrame(rows)
 
 
 def curves(table: pd.DataFrame) -> pd.DataFrame:

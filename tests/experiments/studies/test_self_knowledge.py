@@ -5,12 +5,13 @@ import pandas as pd
 
 from experiments.runs.experiment import Experiment
 from experiments.studies.self_knowledge import figures, study
+from experiments.studies.self_knowledge.planted import lift_wheels
 from tests.fixtures.fakes import circle
 
 
 def test_lifted_wheels_stand_for_a_part_of_the_drive():
     recording = circle(seed=1, n_frames=240, kr=0.0, kl=0.0)
-    lifted = study.lift_wheels(recording)
+    lifted = lift_wheels(recording)
     whole, rest = (np.abs(np.diff(r.wheels.position_m[:, 0])) for r in (recording, lifted))
     gone = rest < 0.5 * whole
     assert 0.05 < gone[whole > 0.0].mean() < 0.15
