@@ -22,6 +22,7 @@ SUITES = {
     "compile": ("compile",),
     "growth": ("growth",),
     "external": ("external",),
+    "bound": ("bound",),
     "score": ("score",),
     "worlds": ("worlds",),
 }
