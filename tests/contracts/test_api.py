@@ -37,6 +37,7 @@ class Still:
         return estima.Belief(self.prior.mean, np.eye(3))
 
 
+@pytest.mark.slow
 def test_its_examples():
     failed, tried = doctest.testmod(estima)
     assert failed == 0
@@ -189,6 +190,7 @@ def test_belief_and_truth_that_differ_are_said(capsys):
     assert capsys.readouterr().err == ""
 
 
+@pytest.mark.slow
 def test_a_sweep_resumes_and_keeps_its_rows_apart(folder, capsys):
     swept = (*QUICK, "seed=range(0,2)", "hydra/launcher=basic")
     arguments = list(sys.argv)
@@ -208,6 +210,7 @@ def test_a_sweep_resumes_and_keeps_its_rows_apart(folder, capsys):
     assert (folder / "seeds.svg").exists()
 
 
+@pytest.mark.slow
 def test_a_sweep_follows_the_current_folder(folder, monkeypatch):
     """Workers that joblib keeps from an earlier sweep do not write to its folder."""
     for name in ("a", "b"):

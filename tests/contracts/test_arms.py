@@ -45,6 +45,7 @@ def of_one_seed(name):
     return [run for run in plan_experiments([f"study={name}", "seed=1000"]) if run.seed == 1000]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("table", "compared"),
     [

@@ -265,13 +265,17 @@ def test_the_sensors_can_be_chosen():
 
 OPTIONS = option_names("estimator")
 OPTIONS = [name for name in OPTIONS if not name.endswith("_tuned")]  # other values only
+DEAR = ("graph_slam", "mcl", "peers/", "topological_mcl")
 FEWER = {
     "mcl": ["estimator.max_particles=1000", "estimator.min_particles=300"],  # particles; else 20 s
     **fakes.PROGRAMS,
 }
 
 
-@pytest.mark.parametrize("name", OPTIONS)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=[pytest.mark.slow] * name.startswith(DEAR)) for name in OPTIONS],
+)
 def test_every_option_conforms(name):
     with fakes.peers_may_be_missing():
         results = conform_target(name, FEWER.get(name, []))

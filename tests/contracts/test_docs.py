@@ -78,10 +78,12 @@ def site(tmp_path_factory):
     return folder, done.stdout + done.stderr
 
 
+@pytest.mark.slow
 def test_it_builds_without_a_warning(site):
     assert site[1] == ""
 
 
+@pytest.mark.slow
 def test_it_has_a_page_for_every_document(site):
     folder, _ = site
     for page in (ROOT / "docs").glob("*.md"):
@@ -89,6 +91,7 @@ def test_it_has_a_page_for_every_document(site):
         assert (place / "index.html").exists(), page.name
 
 
+@pytest.mark.slow
 def test_each_command_and_estimator_has_its_place(site):
     commands = (site[0] / "reference" / "commands" / "index.html").read_text()
     for name in (name for commands in _COMMANDS.values() for name in commands):
@@ -106,6 +109,7 @@ def test_each_command_and_estimator_has_its_place(site):
     assert "kiss_icp_tuned" in peer.partition("On the boards")[2]
 
 
+@pytest.mark.slow
 def test_each_key_is_in_the_reference(site):
     page = (site[0] / "reference" / "configuration" / "index.html").read_text()
     for key in ("simulation.rays", "prior.map", "team.size", "robot.kr", "route.distance_m"):
@@ -115,6 +119,7 @@ def test_each_key_is_in_the_reference(site):
             assert f"<code>{group}={name}</code>" in page, name
 
 
+@pytest.mark.slow
 def test_the_gallery_has_every_figure_and_what_makes_it(site):
     page = (site[0] / "gallery" / "index.html").read_text()
     for figure in (ROOT / "results" / "figures").glob("*.png"):
@@ -125,6 +130,7 @@ def test_the_gallery_has_every_figure_and_what_makes_it(site):
         assert study in option_names("study"), study
 
 
+@pytest.mark.slow
 def test_it_documents_the_api(site):
     page = (site[0] / "api" / "index.html").read_text()
     functions = [name for name in estima.__all__ if name[0].islower()]
@@ -136,6 +142,7 @@ def test_it_documents_the_api(site):
         assert f'id="{kind.__module__}.{name}"' in page
 
 
+@pytest.mark.slow
 def test_its_examples_are_the_scripts(site):
     pages = [ROOT / "docs" / name for name in ("examples/index.md", "programs.md", "regression.md")]
     shown = [name for page in pages for name in re.findall(r'--8<-- "(.*?)"', page.read_text())]
@@ -147,6 +154,7 @@ def test_its_examples_are_the_scripts(site):
     assert "Dead reckoning whose covariance" in (site[0] / "examples" / "index.html").read_text()
 
 
+@pytest.mark.slow
 def test_it_loads_nothing_from_elsewhere(site):
     for path in site[0].rglob("*.html"):
         text = path.read_text()

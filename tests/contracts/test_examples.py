@@ -70,6 +70,7 @@ def test_own_sensor(example, monkeypatch):
     assert len((FOLDER / "beacon" / "beacon.py").read_text().splitlines()) < 40
 
 
+@pytest.mark.slow
 def test_own_world(example):
     said, written, names = example("own_world")
     assert written == WRITES["own_world"]

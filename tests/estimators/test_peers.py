@@ -126,7 +126,7 @@ def test_mrpt_follows_exact_wheels_and_ranges(option, most_m):
     settings += ["sensors.laser.mount.x_m=0.3", "sensors.laser.mount.yaw_rad=0.7"]
     settings += ["sensors.laser.max_range_m=20", "sensors.laser.sigma_range_m=1e-4"]
     settings += ["route=tour", "route.distance_m=6", "robot.kr=0", "robot.kl=0"]
-    settings += ["simulation.physics=kinematic", "prior.map=world", f"estimator={option}"]
+    settings += ["simulation.physics=kinematic", "prior.map=world", f"estimator=peers/{option}"]
     row = evaluate(Experiment.compose(settings))[0]
     assert row["status"] == "ok"
     assert row["ate_rmse_m"] < most_m

@@ -78,6 +78,7 @@ def unfairness(make):
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PEERS)
 def test_peers_believe_what_they_are_told(name):
     with fakes.peers_may_be_missing():

@@ -342,6 +342,7 @@ def test_false_closures_are_not_believed(laps, monkeypatch):
     assert error_m(laps, online).max() < 0.03
 
 
+@pytest.mark.slow
 def test_a_false_loop_is_withdrawn_when_what_follows_denies_it(laps):
     """Planted and believed after a lap; the walls that are seen from then on do not fit."""
     estimator = GraphSlam(kr=5e-4, kl=5e-4, keyframe_distance_m=0.3, robust_sigma=1e4)
@@ -372,6 +373,7 @@ def test_without_closures_it_is_a_chain(laps):
     np.testing.assert_allclose(revised.means, online.means, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_it_conforms():
     recording = circle(n_frames=60)
     results = check_estimator(

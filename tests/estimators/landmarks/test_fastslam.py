@@ -229,6 +229,7 @@ def test_wrong_options_are_told(wrong):
         FastSLAM(**wrong)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "options",
     [

@@ -71,6 +71,7 @@ class _Perfect:
         return Match(Gaussian(motion, self.R), "ok", np.eye(3), np.zeros((3, 3)), 1.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share", [0.0, 0.7, 1.0])
 def test_consistent_where_its_model_holds(share):
     R, k = np.diag([4e-6, 4e-6, 1e-6]), 1e-4

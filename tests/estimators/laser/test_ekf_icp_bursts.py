@@ -47,6 +47,7 @@ def test_wheels_that_slip_by_decimetres_at_once_are_outvoted():
     assert none == 0 < bursts
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("world", ["room", "curved"])
 def test_wheels_believed_far_too_good_are_outvoted(world):
     recording = simulated(f"{STEADY} robot.kr=1e-4 robot.kl=1e-4 world={world}")

@@ -29,6 +29,7 @@ def test_scenes_lie_in_their_place(world):
             assert np.hypot(moved[0], moved[1]) == pytest.approx(0.05, abs=0.01)
 
 
+@pytest.mark.slow
 def test_nees_distinguishes_a_fitting_covariance_from_a_wrong_one(world, monkeypatch):
     def table():
         rng = np.random.default_rng(4)

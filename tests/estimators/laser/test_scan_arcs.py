@@ -164,6 +164,7 @@ def test_noise_is_measured_away_from_the_edges_of_chair_legs():
     assert np.median(noises[False]) > 1.5 * np.median(noises[True])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("world", [pillars, legs])
 def test_errors_are_believed_among_pillars_and_chair_legs(world):
     walls = world()

@@ -68,6 +68,7 @@ def test_a_turn_during_the_sweep_does_not_turn_the_motion():
     assert np.hypot(*(found.motion.mean - MOVED)[:2]) < 0.01
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("fault", "informed"), [("bias_share=0.005", 4.0), ("sweep_s=0.09", 4.0)])
 def test_the_filter_knows_what_real_lasers_do_to_it(fault, informed):
     """Ranges that are all off alike, and a sweep during which the wheels slip."""

@@ -76,6 +76,7 @@ def test_a_scan_that_is_not_used_tells_of_wheels_that_stand():
     assert said[-1] > 0.4
 
 
+@pytest.mark.slow
 def test_knows_its_error():
     """With likelihoods at their worth and no jitter, over recordings, and scans of 60 beams."""
     squares = []
@@ -238,6 +239,7 @@ def test_one_particle():
     assert np.isfinite(beliefs[-1].mean).all()
 
 
+@pytest.mark.slow
 def test_conforms():
     recording = circle(3, n_frames=40)
     checks = check_estimator(lambda: Mcl(max_particles=1000), recording, tracking_prior(recording))

@@ -154,6 +154,7 @@ def test_open3d_puts_its_planes_through_the_matched_points(seed):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("arm", ARMS)
 def test_a_registration_rests_where_the_printed_iterations_do(arm):
     """With weights all alike; the product's gates and stages leave the minimum where it is."""

@@ -173,6 +173,7 @@ def test_localizes_globally_on_a_clear_route(options):
     assert all(1.0 <= ess <= 160.0 + 1e-6 for ess in found.extras["ess"])
 
 
+@pytest.mark.slow
 def test_conforms():
     recording, prior = place_route()
     for options in ({}, PAPER, {"weighting": "M3", "scheme": "residual", "n_nearest": 2}):

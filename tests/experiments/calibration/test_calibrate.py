@@ -190,6 +190,7 @@ def test_refusals_name_the_remedy():
         from_wheel_truth(np.ones((9, 2)), np.zeros((9, 2)), interval_s=0.05)
 
 
+@pytest.mark.slow
 def test_the_studies_are_composed_of_table_1_and_robots_that_differ_in_slip():
     for arm in arms("coverage"):
         assert arm.routes == TABLE_1

@@ -251,6 +251,7 @@ def test_command(tmp_path, log):
     assert out.with_suffix(".png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_a_laser_upside_down_is_found():
     log = log_of(90.0, sensor="laser", with_truth=False)
     readings = log.log("laser")

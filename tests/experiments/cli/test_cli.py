@@ -350,6 +350,7 @@ def test_conform_runs_by_name():
     assert done.stdout.count("pass") >= 8
 
 
+@pytest.mark.slow
 def test_a_users_own_estimator(tmp_path):
     """One Python file and one YAML, anywhere on disk: the example of the tutorial."""
     text = (ROOT / "docs" / "tutorial.md").read_text()

@@ -37,6 +37,7 @@ def test_the_command_shows_and_clears(folder, tmp_path):
     refused(estima("cache", ESTIMA_CACHE_GIB="much"), "ESTIMA_CACHE_GIB", "'much'")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("after", [False, True])
 def test_results_go_to_the_folder_of_the_option(tmp_path, after):
     run = ["run", *QUICK, "route=linear_1", "name=moved"]

@@ -106,6 +106,7 @@ CHEATS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cheat", CHEATS)
 def test_conform_names_the_way_that_a_cheat_takes(cheat, case):
     recording, prior = case

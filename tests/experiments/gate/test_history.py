@@ -64,6 +64,7 @@ def marks(points, estimator, metric="ate_rmse_m"):
     return {int(n): mark for n, mark in zip(line["number"], line["mark"], strict=True) if mark}
 
 
+@pytest.mark.slow
 def test_changes_are_marked_where_they_were_planted(rows):
     points = trace(rows)
     for name in ("e", "drawn"):
@@ -193,6 +194,7 @@ def test_the_page_is_one_file_in_which_nothing_is_code(page, rows):
     assert text.count('<a href="https://example.org/a/b/commit/00') == n_changes
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("width", "columns"), [(1400, 3), (390, 1)])
 def test_the_page_in_a_browser(page, width, columns):
     if browser.find() is None:

@@ -163,6 +163,7 @@ def test_what_is_made_elsewhere_needs_its_trajectories(elsewhere, small, tmp_pat
         baseline.check(str(small), candidate=tmp_path)
 
 
+@pytest.mark.slow
 def test_recordings_of_the_check_turn():
     """On a straight line a wrong track, and much else, would go unseen."""
     suite = read_suite(suite_path("check"))

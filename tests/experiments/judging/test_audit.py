@@ -135,6 +135,7 @@ def test_every_table_that_can_be_made_again_is_there():
 # Finding
 
 
+@pytest.mark.slow
 def test_a_digit_changed_in_one_row_of_500_is_found_as_often_as_theory_says():
     """200 audits by resampling rows that were made already: 1000 rows, 2 of them changed."""
     made = as_written(table_of("gil2008", "particles")[:1000])

@@ -336,6 +336,7 @@ def test_the_filter_of_the_study_is_the_one_as_printed(case):
     assert not np.array_equal(noisy.known_map.descriptors, case.known_map.descriptors)
 
 
+@pytest.mark.slow
 def test_the_tracked_tables_and_arrays_redraw_every_figure():
     made = Results(SOURCE / "results", "maximo2024")
     tracked = {path.stem for path in (SOURCE / "results" / "figures").glob("maximo2024_*.png")}

@@ -37,6 +37,7 @@ def test_blas_has_one_thread_unless_more_are_asked_for(monkeypatch, of_blas):
     assert threads() == {2}
 
 
+@pytest.mark.slow
 def test_workers_are_limited_too(monkeypatch):
     monkeypatch.delenv(NAME, raising=False)
     with joblib.parallel_config("loky", inner_max_num_threads=2):

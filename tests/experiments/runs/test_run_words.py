@@ -109,6 +109,7 @@ def test_the_picture_shows_the_path_and_few_ellipses_however_large():
     assert np.ptp(plan.get_xlim()) < 6.0 + 2 * 3.0 + 1.0
 
 
+@pytest.mark.slow
 def test_a_sweep_shows_its_small_table_and_what_comes_next(tmp_path):
     overrides = ["route=linear_1", "seed=0,1", "name=small", "hydra/launcher=basic"]
     done = estima("run", "-m", *QUICK, *overrides, ESTIMA_RESULTS=str(tmp_path))

@@ -228,6 +228,7 @@ def test_pictures_of_a_team(tmp_path):
     assert not np.array_equal(bare[-1], list(pictures(seeing))[-1])
 
 
+@pytest.mark.slow
 def test_a_suite_may_hold_a_team(tmp_path):
     path = tmp_path / "mine.yaml"
     lines = ["study=teams", "team.size=2", "route.distance_m=2"]

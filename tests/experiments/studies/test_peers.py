@@ -130,6 +130,7 @@ def test_what_is_missing_is_told(tmp_path, monkeypatch):
     assert study.missing(Experiment.compose(["estimator=odometry"])) == ""
 
 
+@pytest.mark.slow
 def test_it_runs_when_named_and_leaves_the_tuning_alone(tmp_path, monkeypatch):
     assert "peers" in reproduce._chosen(None)
     monkeypatch.setenv("ESTIMA_RESULTS", str(tmp_path))

@@ -73,6 +73,7 @@ def methods(case, *names):
     return iter([one for one in COMPOSED[slip.kr] if one.estimator_name in names])
 
 
+@pytest.mark.slow
 def test_a_users_folder_of_logs(folder):
     assert [path.name for path in own_logs.own_logs(folder)] == ["hall.npz", "room.npz"]
     for path, kind in zip(own_logs.own_logs(folder), (logs.POSES, logs.RELATIONS), strict=True):

@@ -36,7 +36,13 @@ def runs_of(name, folder):
 
 @pytest.mark.parametrize(
     "name",
-    [pytest.param(n, marks=[pytest.mark.slow] * (n in ("leaderboard", "peers"))) for n in STUDIES],
+    [
+        pytest.param(
+            n,
+            marks=[pytest.mark.slow] * (n in ("all_estimators", "boards", "leaderboard", "peers")),
+        )
+        for n in STUDIES
+    ],
 )
 def test_each_study_fits_together(name, tmp_path):
     for experiment in runs_of(name, tmp_path):

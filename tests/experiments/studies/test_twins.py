@@ -75,6 +75,7 @@ def test_a_twin_that_predicts_is_reproduced():
     assert {c.role for c in (right, own, other)} == {Role.BESIDE}
 
 
+@pytest.mark.slow
 def test_twins_that_cover_too_little_or_predict_no_better_fail():
     off, said = verdicts(runs(), minutes(shift=4.0))
     assert said["TW1"] is Verdict.NOT_REPRODUCED

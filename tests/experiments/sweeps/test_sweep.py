@@ -29,6 +29,7 @@ from tests.experiments.sweeps.conftest import ALONE, SHORT, clear, folder, table
 from tests.fixtures import kill_sweeps
 
 
+@pytest.mark.slow
 def test_failed_runs_leave_rows_and_the_rest_goes_on(name, tmp_path):
     broken = tmp_path / "broken.py"
     broken.write_text(

@@ -156,6 +156,7 @@ def test_decisions_follow_from_the_rows_whatever_else_is_there(decided):
     assert same == found
 
 
+@pytest.mark.slow
 def test_the_best_of_equal_arms_is_hardly_ever_dropped():
     """Five arms, none of which is better: each is dropped in at most 5 % of sweeps."""
     rng, wrong = np.random.default_rng(0), 0
@@ -209,6 +210,7 @@ def test_against_goes_with_a_sweep():
     refused(done, "--against odometry: goes with -m and until=decided")
 
 
+@pytest.mark.slow
 def test_a_sweep_ends_when_it_is_decided_and_goes_on_where_it_was(name):
     """Real runs: the arm that believes another track errs more, and 8 seeds are saved."""
     arguments = ["run", "-m", *ALONE, "route=angular_4", "estimator=odometry",

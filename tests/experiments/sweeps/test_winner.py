@@ -85,6 +85,7 @@ def test_two_recordings_are_too_few_and_one_arm_is_no_contest():
     assert find_winner(rows({"a": DRIVES})) is None
 
 
+@pytest.mark.slow
 def test_false_alarms_among_equals_are_held():
     rng = np.random.default_rng(5)
     n, wrong = 400, 0

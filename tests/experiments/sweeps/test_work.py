@@ -59,6 +59,7 @@ with Parallel(n_jobs=2) as workers:
 """
 
 
+@pytest.mark.slow
 def test_an_idle_worker_ends_with_its_planner():
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
     with subprocess.Popen([sys.executable, "-c", _IDLE], cwd=ROOT, **pipes) as planner:

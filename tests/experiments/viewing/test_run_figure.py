@@ -32,6 +32,7 @@ def estimate():
     return online
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [np.nan, np.inf, -1e308, 1e200])
 @pytest.mark.parametrize("first", [0, 20])
 def test_any_estimate_is_drawn(tmp_path, estimate, number, first):

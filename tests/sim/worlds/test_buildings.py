@@ -27,6 +27,7 @@ def along(path, step_m=0.1):
     return np.concatenate(pieces)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", WORLDS)
 def test_tours_keep_clear_of_walls(name):
     for seed in (0, 1, 50, 1003):

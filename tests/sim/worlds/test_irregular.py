@@ -25,6 +25,7 @@ def built(kind, seed=0, **options):
     return kind(n_landmarks=0, **options).build(np.random.default_rng(seed))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("seed", [0, 1])
 def test_tours_keep_clear_and_can_be_driven(kind, seed):
