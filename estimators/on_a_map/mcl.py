@@ -145,8 +145,8 @@ class Mcl(MclOptions):
     The defaults find the robot anywhere and keep it among people; tempering and jitter make the
     particles spread wider than their mean errs. The belief is the fit of all beams to the walls,
     where there is one hypothesis and the fit holds, with its covariance, else that of the
-    particles. Particles that know their error, without the fit, want beam_power=1, min_ess=0,
-    sigma_m of 0.05, and no jitter.
+    particles. Where the walls are exact, fits are joined by the wheels. Particles that know their
+    error, without the fit, want beam_power=1, min_ess=0, sigma_m of 0.05, and no jitter.
 
     Without a start pose the particles are drawn by the first scan, and later ones are injected by
     the current one: along a corridor, where long beams fix the heading closely, a uniform draw
