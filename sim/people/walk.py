@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 from pydantic import NonNegativeInt
@@ -68,15 +67,6 @@ class People:
         """Of the upright cylinder that holds a person, whatever the legs do."""
         legs_m = math.hypot(self.stride_m / 4.0, self.legs_apart_m / 2.0) + self.leg_radius_m
         return max(self.torso_radius_m, legs_m)
-
-
-class Obstacle(NamedTuple):
-    """A robot as people see it: where it is, how large, and how far it rolls until it stands."""
-
-    x_m: float
-    y_m: float
-    radius_m: float
-    stop_m: float
 
 
 class Crowd:

@@ -109,18 +109,6 @@ def read_grid(path: str | Path) -> OccupancyGrid:
     return OccupancyGrid(probability, resolution_m, np.array(pose))
 
 
-def image_of(path: Path) -> Path | None:
-    """The image that a grid's YAML file names; None for any other file."""
-    if path.suffix not in SUFFIXES:
-        return None
-    try:
-        document = _document(path)
-    except InputError:
-        return None
-    image = document.get("image")
-    return path.parent / image if isinstance(image, str) and image else None
-
-
 def write_grid(
     grid: OccupancyGrid, path: Path, mode: Literal["trinary", "raw"] = "trinary"
 ) -> None:

@@ -21,7 +21,6 @@ CONTROLS = ("oxford_plane", "umh_plane")
 
 N_WORLDS = {Profile.FULL: 20, Profile.QUICK: 2}  # of each route; of the weightings, by design
 N_RUN_SEEDS = {Profile.FULL: 3, Profile.QUICK: 1}  # worlds of each of the fifteen Oxford runs
-N_CAMPUSES = {Profile.FULL: 20, Profile.QUICK: 1}
 N_RETRIEVED_CAMPUSES = 5
 # MX5 and MX8, sizes by design.yaml
 CLUSTERED = ("ring_key", "m2dp")  # Scan Context turns with the robot: k-means does not allow for it

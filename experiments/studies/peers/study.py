@@ -17,7 +17,7 @@ from experiments.runs.row import Outcome, Row
 from experiments.studies.peers import edges
 from experiments.studies.peers.logs import LOGS, ordered, over_log
 from experiments.studies.peers.own_logs import over_folder as over_folder
-from experiments.studies.peers.settings import CLASSES, COMPETING, TUNED
+from experiments.studies.peers.settings import CLASSES, COMPETING
 from experiments.studies.peers.version import missing, sensor_of, version_of
 from experiments.sweeps.averages import MIN_UNITS, averages
 from experiments.sweeps.plan import plan_experiments
@@ -170,11 +170,3 @@ def _compared(rows: pd.DataFrame, place: str) -> pd.DataFrame:
                 found |= {"over_best": ratio.value, "low": ratio.low, "high": ratio.high}
             parts.append({**dict(zip(_METHOD, (*board, *name), strict=True)), **found})
     return pd.DataFrame(parts).set_index(_METHOD)
-
-
-def best_where(found: pd.DataFrame, sensor: str, answer: str) -> dict[str, list[str]]:
-    """Methods, with their arms, that are level with the best: over all (`""`), and by class."""
-    part = found[(found["sensor"] == sensor) & (found["answer"] == answer) & found["competes"]]
-    places = {"": "level", **{name: f"level_{name}" for name in CLASSES}}
-    named = part["estimator"].str.removesuffix(TUNED) + " (" + part["arm"] + ")"
-    return {place: list(named[part[column].astype(bool)]) for place, column in places.items()}

@@ -87,11 +87,6 @@ def test_a_class_of_one_drive_tests_nothing():
     assert found.loc[found["competes"], "level_rooms"].all()
 
 
-def test_who_is_best_where():
-    where = study.best_where(study.methods(runs()), "laser, known map", "online")
-    assert where == {place: ["mrpt_mcl (shipped)"] for place in ("", *CLASSES)}
-
-
 def test_a_failed_run_counts_as_a_large_error():
     table = runs()
     mine = table["estimator"] == "small_gicp"
