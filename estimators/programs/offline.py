@@ -52,7 +52,7 @@ class OfflineOptions(ProgramOptions):
     limit_s: Seconds = 600.0
     """Longest time that it may take, s."""
     output: Output = "tum"
-    """Format of {out}: `tum`, or with covariances `mcap` or `bag` (nav_msgs/Odometry)."""
+    """Format of {out}: `tum`, or `mcap` or `bag` (nav_msgs/Odometry)."""
     kind: Kind = "revised"
     """`revised`, or `online` where each pose of its trajectory saw only its past."""
 

@@ -40,12 +40,12 @@ def read_track(path: Path, topic: str | None = None) -> Track:
         track = _of_bag(path, topic)
     else:
         require(topic is None, f"{path}: only a bag has topics, and this is not one")
-        stamps, means, heights_m, tilts_rad = read_spatial_tum(path)
+        stamps, means, heights_m, tilts_rad, covariances = read_spatial_tum(path)
         require(len(stamps), f"{path}: holds no pose")
         track = Track(
             stamps,
             means,
-            np.zeros((len(stamps), 3, 3)),
+            covariances,
             tilt_rad=float(tilts_rad.max()),
             height_m=float(np.ptp(heights_m)),
         )

@@ -1,4 +1,8 @@
-"""TUM trajectories: lines of `timestamp tx ty tz qx qy qz qw`."""
+"""TUM trajectories: lines of `timestamp tx ty tz qx qy qz qw`.
+
+Behind these may stand a planar covariance in map, `xx xy xh yy yh hh` (m and rad; h is the heading):
+no part of the format, but the plainest way for a program to say what it believes.
+"""
 
 from pathlib import Path
 
@@ -7,6 +11,9 @@ import numpy as np
 from sim.arrays import Array
 from sim.files import write_whole
 from sim.formats.text import Words, read_words
+
+_COVARIANCE = "xx xy xh yy yh hh"
+_UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
 def write_tum(path: Path, stamps: Array, poses: Array) -> None:
@@ -23,16 +30,29 @@ def read_tum(source: Path | Words) -> tuple[Array, Array]:
     Raises
     ------
     InputError
-        Naming the file and the line that is not eight finite numbers.
+        Naming the file and the line that is not eight finite numbers, or fourteen.
     """
     return read_spatial_tum(source)[:2]
 
 
-def read_spatial_tum(source: Path | Words) -> tuple[Array, Array, Array, Array]:
-    """As `read_tum`, with what it drops: heights (T,) m, tilts (T,) rad of its upright axis."""
+def read_spatial_tum(source: Path | Words) -> tuple[Array, Array, Array, Array, Array]:
+    """As `read_tum`, with what it drops.
+
+    Returns
+    -------
+    tuple
+        Stamps and poses, heights (T,) m, tilts (T,) rad of its upright axis, and covariances
+        (T, 3, 3), zeros where a line has none.
+    """
     columns, words = "timestamp tx ty tz qx qy qz qw", read_words(source)
-    words.refuse(words.counts != 8, words.lines, f"a line must be {columns}")
+    knows = words.counts == 8 + len(_UPPER)
+    complaint = f"a line must be {columns}, with or without a covariance {_COVARIANCE} behind it"
+    words.refuse(~knows & (words.counts != 8), words.lines, complaint)
     table = words.numbers(words.lines, 0, 8, columns)
+    covariances = np.zeros((len(table), 3, 3))
+    upper = words.numbers(words.lines[knows], 8, len(_UPPER), _COVARIANCE)
+    for (i, j), values in zip(_UPPER, upper.T, strict=True):
+        covariances[knows, i, j] = covariances[knows, j, i] = values
     stamps, x, y, height, qx, qy, qz, qw = table.T
     with np.errstate(over="ignore"):
         norm = np.sum(table[:, 4:] ** 2, axis=1)
@@ -40,4 +60,4 @@ def read_spatial_tum(source: Path | Words) -> tuple[Array, Array, Array, Array]:
     words.refuse(~sound, words.lines, "numbers must be finite, the quaternion of length 1")
     yaw = np.arctan2(2.0 * (qw * qz + qx * qy), norm - 2.0 * (qy * qy + qz * qz))
     tilt = 2.0 * np.arctan2(np.hypot(qx, qy), np.hypot(qz, qw))
-    return stamps.copy(), np.stack([x, y, yaw], axis=1), height, tilt
+    return stamps.copy(), np.stack([x, y, yaw], axis=1), height, tilt, covariances

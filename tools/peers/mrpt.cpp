@@ -107,7 +107,7 @@ bool read_start(const std::string& path, CPosePDFGaussian& start) {
 
 void write_pose(std::ofstream& out, double stamp, const CPose2D& pose) {
   char line[200];
-  std::snprintf(line, sizeof line, "%.9f %.17g %.17g 0 0 0 %.17g %.17g\n", stamp, pose.x(), pose.y(),
+  std::snprintf(line, sizeof line, "%.9f %.17g %.17g 0 0 0 %.17g %.17g", stamp, pose.x(), pose.y(),
                 std::sin(pose.phi() / 2), std::cos(pose.phi() / 2));
   out << line;
 }
@@ -251,6 +251,7 @@ void build_map(Builder& builder, const std::vector<Scan>& scans, const CPose2D& 
     builder.processActionObservation(actions, frame);
     const CPose2D believed(builder.getCurrentPoseEstimation()->getMeanVal());
     write_pose(out, scans[i].stamp, start + believed);
+    out << "\n";
   }
 }
 
@@ -302,7 +303,15 @@ void run_mcl(const std::vector<Scan>& scans, const CPosePDFGaussian* start, std:
     mrpt::obs::CSensoryFrame frame;
     frame.insert(scans[i].observation);
     if (i > 0 || !start) filter.executeOn(particles, &actions, &frame);
-    write_pose(out, scans[i].stamp, particles.getMeanVal());
+    const auto [covariance, mean] = particles.getCovarianceAndMean();
+    write_pose(out, scans[i].stamp, mean);
+    char number[30];
+    for (int row = 0; row < 3; ++row)
+      for (int column = row; column < 3; ++column) {
+        std::snprintf(number, sizeof number, " %.17g", covariance(row, column));
+        out << number;
+      }
+    out << "\n";
   }
 }
 

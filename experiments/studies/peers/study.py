@@ -9,7 +9,6 @@ from experiments.judging.logs import why_missing
 from experiments.judging.remake import Cells, Remake
 from experiments.judging.results import Profile, Results
 from experiments.runs.columns import REVISED
-from experiments.runs.compose import find_option
 from experiments.runs.console import warn
 from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
@@ -75,8 +74,7 @@ REMADE = {"runs": 8.0}  # methods are means of them
 
 def remake(_table: str, row: Cells) -> Remake | None:
     """The call that makes a row again; None if its method is not here."""
-    option = find_option("estimator", row["estimator"])
-    given = [f"study/board={row['board']}", f"seed={row['seed']:.0f}", f"estimator={option}"]
+    given = [f"study/board={row['board']}", f"seed={row['seed']:.0f}"]
     for one in plan_experiments(["study=peers", *given]):
         if (one.label("arm"), one.estimator_name) == (row["arm"], row["estimator"]):
             return None if missing(one) else (runs, ([one],))

@@ -10,14 +10,19 @@ from estimators import odometry
 from experiments import audit as module
 from experiments.audit import Drawn, Finding, Place, check, draw, headline_rows, summarize
 from experiments.judging import remake
-from experiments.judging.folders import STUDIES, part
+from experiments.judging.folders import LOGS, STUDIES, part
+from experiments.judging.logs import why_missing
 from experiments.judging.remake import agrees, as_written, differing, is_time, max_share
 from experiments.judging.results import Results
 from experiments.runs.paths import SOURCE
 from sim.errors import InputError
 
 JUDGED = SOURCE / "results"
-NEW = {"segments", "said"}  # tables that wait for the judged run, as those of regions do
+NEW = {
+    "segments",
+    "said",
+    "consistency",
+}  # tables that wait for the judged run, as those of regions do
 
 
 @pytest.fixture(autouse=True)
@@ -130,6 +135,20 @@ def test_every_table_that_can_be_made_again_is_there():
         names = {p.stem.removeprefix(f"{study}_") for p in (JUDGED / "tables").glob(f"{study}_*")}
         made = {name for name in part(study, "study").REMADE if not name.startswith("region_")}
         assert made - NEW <= names
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("study", STUDIES)
+def test_rows_of_every_table_have_a_call_that_makes_them(study):
+    """It is not made here; of programs and of logs that are not here there may be none."""
+    rng, module = np.random.default_rng(0), part(study, "study")
+    for path in sorted((JUDGED / "tables").glob(f"{study}_*.csv")):
+        name = path.stem.removeprefix(f"{study}_")
+        if name in module.REMADE and not (study in LOGS and why_missing()):
+            table = table_of(study, name)
+            for number in rng.choice(len(table), min(3, len(table)), replace=False):
+                call = module.remake(name, row_of(table, int(number)))
+                assert call is None or callable(call[0]), (name, number)
 
 
 # Finding

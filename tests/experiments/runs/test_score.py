@@ -18,7 +18,7 @@ from experiments.viewing.compare import reference_of
 from sim import se2
 from sim.errors import InputError
 from sim.formats.relations import Relations, write_relations
-from sim.formats.trajectory import sound_covariances
+from sim.formats.trajectory import read_track, sound_covariances
 from sim.recording import load, save
 from tests.fixtures import fakes
 
@@ -155,6 +155,19 @@ def files(tmp_path_factory):
     for ending in ("tum", "csv", "mcap"):
         write_estimate(folder / f"est.{ending}", estimate)
     return folder, estimate
+
+
+def test_a_tum_file_may_hold_covariances(tmp_path):
+    path = tmp_path / "known.tum"
+    pose = "1 2 0 0 0 0 1"
+    path.write_text(f"0 {pose} 4 1 0.5 9 0.25 1\n1 {pose}\n")
+    covariances = read_track(path).covariances
+    np.testing.assert_array_equal(covariances[0], [[4, 1, 0.5], [1, 9, 0.25], [0.5, 0.25, 1]])
+    assert not covariances[1].any()
+    for words, complaint in (("4 1 0.5 9 0.25", ":1: a line must be"), ("4 9 0 4 0 1", "pose 1")):
+        path.write_text(f"0 {pose} {words}\n")
+        with pytest.raises(InputError, match=complaint):
+            read_track(path)
 
 
 @pytest.mark.parametrize("ending", ["tum", "csv", "mcap"])
