@@ -1,6 +1,6 @@
 """TUM trajectories: lines of `timestamp tx ty tz qx qy qz qw`.
 
-Behind these may stand a planar covariance in map, `xx xy xh yy yh hh` (m and rad; h is the heading):
+Behind these may stand a planar covariance, `xx xy xh yy yh hh` (m and rad; h is the heading):
 no part of the format, but the plainest way for a program to say what it believes.
 """
 
