@@ -30,3 +30,16 @@ def test_a_misread_start_is_a_loss_that_odometry_misses(monkeypatch):
     assert curve["missed"].iloc[-1] == 1.0  # without alarms
     line = figures.draw_alarms(curve).axes[0].get_lines()[0]
     assert line.get_label() == f"odometry ({len(losses)} losses)"
+
+
+def test_the_share_inside_is_the_mean_over_drives_of_one_length():
+    scores = dict.fromkeys(study._SCORES, 1.0)
+    shares = {1000: 0.9, 1001: 1.0, 10_000: 0.0}  # the last is a drive of the quiet hours
+    rows = [
+        {"method": "mcl", "answer": "online", "seed": seed, **scores, "inside_95_share": share}
+        for seed, share in shares.items()
+    ]
+    (row,) = study.covered(pd.DataFrame(rows)).to_dict("records")
+    assert (row["drives"], row["inside_95_share"]) == (2, 0.95)
+    page = figures.draw_coverage(pd.DataFrame([row]))
+    assert [label.get_text() for label in page.axes[0].get_yticklabels()] == ["mcl"]
