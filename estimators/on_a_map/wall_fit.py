@@ -13,6 +13,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.spatial import KDTree
 
 from estimators.gaussian import STILL, Gaussian, compose, rotate
@@ -163,7 +164,7 @@ class WallFit:
             fitted = self._moved(self._state, self._covariance, beams, noise, slip_per_s)
         if fitted is None:
             state = np.concatenate([guess.mean, self._state[3:]])
-            covariance = _block_diagonal(guess.covariance, self._covariance[3:, 3:])
+            covariance = np.asarray(block_diag(guess.covariance, self._covariance[3:, 3:]))
             fitted = self._moved(state, covariance, beams, noise, slip_per_s)
         self._fitted = self._exact and fitted is not None
         if fitted is None:
@@ -195,19 +196,12 @@ class WallFit:
         if sweep_s == 0.0:
             return _inverse(covariance)
         velocity = rotate(slip_per_s, state[2]) / sweep_s
-        return _block_diagonal(_inverse(covariance), _inverse(velocity))
+        return np.asarray(block_diag(_inverse(covariance), _inverse(velocity)))
 
 
 def _mahalanobis(pose: Array, guess: Gaussian) -> float:
     off = se2.difference(pose, guess.mean)
     return float(off @ _inverse(guess.covariance) @ off)
-
-
-def _block_diagonal(first: Array, second: Array) -> Array:
-    n = len(first)
-    both = np.zeros((n + len(second), n + len(second)))
-    both[:n, :n], both[n:, n:] = first, second
-    return both
 
 
 def _inverse(covariance: Array) -> Array:
