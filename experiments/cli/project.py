@@ -126,7 +126,7 @@ def bench(
     name: Annotated[
         str,
         typer.Argument(
-            help="compile, external, fastslam, formats, graph_slam, growth, icp, mcl, score, "
+            help="bound, compile, external, fastslam, formats, graph_slam, growth, icp, mcl, score, "
             "sim, smoothing, sweep, sweep_scale, teams, topological, worlds, or all."
         ),
     ] = "all",
