@@ -126,8 +126,8 @@ def bench(
     name: Annotated[
         str,
         typer.Argument(
-            help="bound, compile, external, fastslam, formats, graph_slam, growth, icp, mcl, score, "
-            "sim, smoothing, sweep, sweep_scale, teams, topological, worlds, or all."
+            help="bound, compile, external, fastslam, formats, graph_slam, growth, icp, mcl, "
+            "score, sim, smoothing, sweep, sweep_scale, teams, topological, worlds, or all."
         ),
     ] = "all",
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
