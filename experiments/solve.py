@@ -55,11 +55,7 @@ from sim.worlds.grid_file import write_grid
 
 _START = np.diag([1e-6] * 3)  # covariance of the origin
 # Of landmarks: ids are misread, and a camera's errors last from image to image
-_LANDMARKS = (
-    "estimator.errors=invariant",
-    "estimator.gate_probability=1e-6",
-    "estimator.repeat_s=0.5",
-)
+_LANDMARKS = ("estimator.gate_probability=1e-6", "estimator.repeat_s=0.5")
 
 Interrupt = Callable[[], None]  # raises when the user wants an end
 

@@ -49,21 +49,13 @@ class EkfSlamOptions(LandmarkSlamOptions, GainOptions):
     doubt_sightings: Annotated[int, Field(ge=0, le=30)] = 10
     """With a gate: after so many sightings of known landmarks, four fifths of them rejected, the
     pose on which those agree replaces the filter's, which a turn unseen by the wheels locks out."""
-    errors: Errors = "coordinates"
-    """What the covariance describes. `coordinates`: the differences of headings and positions.
-    `invariant`: the turn and shift of the whole map about the origin of the map frame, and what is
-    left of each landmark: x = R(e_turn) x_hat + e_x for every position x, the robot's too. What is
-    seen does not change with the turn, so no update can make the heading of the whole map look
-    known, which linearising at ever other estimates does (Barrau and Bonnabel, "An EKF-SLAM
-    algorithm with consistency properties", 2015)."""
-
-    def __post_init__(self) -> None:
-        LandmarkSlamOptions.__post_init__(self)
-        GainOptions.__post_init__(self)
-        require(
-            not (self.gain_sigma and self.errors == "invariant"),
-            "ekf_slam: errors=invariant knows the gains; set estimator.gain_sigma=0",
-        )
+    errors: Errors = "invariant"
+    """What an update corrects. `coordinates`: headings and positions, as the classical filter does.
+    `invariant`: the turn and shift of all that a robot has placed, itself too, about the origin of
+    the map frame, and what is left of each position: x = R(e_turn) x_hat + e_x, where e_turn is the
+    error of the robot's heading. What it sees does not change with the turn, so no update can make
+    the heading of the whole map look known, which linearising at ever other estimates does (Barrau
+    and Bonnabel, "An EKF-SLAM algorithm with consistency properties", 2015)."""
 
 
 class EkfSlam(EkfSlamOptions, TeamEstimator):
@@ -96,14 +88,10 @@ class EkfSlam(EkfSlamOptions, TeamEstimator):
         Raises
         ------
         InputError
-            If the robots do not carry the same sensors, a start is unknown and the camera does not
-            identify landmarks, or the errors are invariant.
+            If the robots do not carry the same sensors, or a start is unknown and the camera does
+            not identify landmarks.
         """
-        n, self.invariant = len(priors), self.errors == "invariant"
-        require(
-            n == 1 or not self.invariant,
-            "ekf_slam: errors=invariant holds for one robot; set estimator.errors=coordinates",
-        )
+        n = len(priors)
         require(
             n == 1 or not self.gain_sigma,
             "ekf_slam: gains of wheels hold for one robot; set estimator.gain_sigma=0",
@@ -127,6 +115,7 @@ class EkfSlam(EkfSlamOptions, TeamEstimator):
         self._motions = [STILL] * n  # since the last image
         after = 0 if self.gate_probability is None else self.doubt_sightings
         self._doubts = [Doubt(after) for _ in range(n)]
+        self._placed_by = np.zeros(0, np.int64)  # robot that has added each landmark
         self._n_trusted = [0] * n  # landmarks when a robot's last sighting of one passed the gate
 
     def step_team(self, frames: Sequence[Frame]) -> list[Belief]:
@@ -164,7 +153,7 @@ class EkfSlam(EkfSlamOptions, TeamEstimator):
         if not self._is_placed[frame.robot]:
             return Belief(np.full(3, np.nan), np.full((3, 3), np.nan), extras)
         own = _own(frame.robot)
-        pose = Gaussian(self._state.mean[own], self._pose_covariance(frame.robot))
+        pose = Gaussian(self._state.mean[own], self._state.covariance[own, own])
         if self._gains:
             both = slice(own.start, self._gains.stop)  # of one robot: its pose and the gains
             P = self._state.covariance[both, both].copy()
@@ -187,13 +176,7 @@ class EkfSlam(EkfSlamOptions, TeamEstimator):
         n, P, first = self._n_landmarks, self._state.covariance, self._first_landmark
         every = np.arange(n)
         blocks = P[first:, first:].reshape(n, 3, n, 3)[every, :, every].reshape(n, 3, 3)
-        means = self._landmarks.copy()
-        if self.invariant:
-            arm = _quarter_turned(means)
-            mixed = arm[:, :, None] * P[2, first:].reshape(n, 1, 3)
-            blocks = blocks + mixed + mixed.transpose(0, 2, 1)
-            blocks += P[2, 2] * arm[:, :, None] * arm[:, None, :]
-        return self.front_end.map(means, blocks, slice(n))
+        return self.front_end.map(self._landmarks.copy(), blocks, slice(n))
 
     @property
     def _n_landmarks(self) -> int:
@@ -216,14 +199,6 @@ class EkfSlam(EkfSlamOptions, TeamEstimator):
         mean, by_pose, by_motion = compose(self._state.mean[own], motion.mean)
         noise = by_motion @ motion.covariance @ by_motion.T
         self._state.mean[own], self._motions[robot] = mean, STILL
-        if self.invariant:
-            # a turn of the robot alone is one of the whole map, and of the landmarks back
-            by_noise = np.zeros((len(P), 3))
-            by_noise[:3] = np.eye(3)
-            by_noise[:2, 2] = -_quarter_turned(mean)[:2]
-            by_noise[3:, 2] = -_quarter_turned(self._landmarks).ravel()
-            P += by_noise @ ((noise + noise.T) / 2.0) @ by_noise.T
-            return
         moved = by_pose @ P[own, own] @ by_pose.T + (noise + noise.T) / 2.0
         P[own] = by_pose @ P[own]
         P[:, own] = P[own].T
@@ -311,23 +286,12 @@ class EkfSlam(EkfSlamOptions, TeamEstimator):
         if pose is None:
             return False
         P, own = self._state.covariance, _own(robot)
-        if self.invariant:
-            self._shear(1.0)
         P[own], P[:, own] = 0.0, 0.0
         P[own, own], self._state.mean[own] = _ENTERS, pose
         for rows in self._rows(np.arange(self._n_trusted[robot], self._n_landmarks)):
             P[rows, rows] += _FORGOTTEN_M**2
-        if self.invariant:
-            self._shear(-1.0)
         self._doubts[robot].clear()
         return True
-
-    def _shear(self, sign: float) -> None:
-        """Make the covariance of a motion of the whole map that of coordinates, or (-1) back."""
-        P = self._state.covariance
-        arm = sign * _quarter_turned(self._state.mean.reshape(-1, 3)).ravel()
-        P += np.outer(arm, P[2])
-        P += np.outer(P[:, 2], arm)
 
     def _rows(self, slots: Ints) -> Ints:
         """Rows (K, 3) of landmarks in the state."""
@@ -375,37 +339,34 @@ class EkfSlam(EkfSlamOptions, TeamEstimator):
         return correction is not None
 
     def _correct(self, by: Array) -> None:
-        """Correct the mean by an error (n,): added, or a motion of the whole map."""
-        if self.invariant:
-            turn = float(by[2])
-            R, V = _exponential(turn)
-            blocks = self._state.mean.reshape(-1, 3)  # pose and landmarks
-            blocks[:, :2] = blocks[:, :2] @ R.T + by.reshape(-1, 3)[:, :2] @ V.T
-            self._state.mean[5::3] += by[5::3]
-            self._state.mean[2] += turn
-        else:
-            self._state.mean += by
-        for row in range(2, 3 * len(self._motions), 3):
-            self._state.mean[row] = wrap(float(self._state.mean[row]))
+        """Correct the mean by (n,) errors of its coordinates: added, or motions of maps.
+
+        The covariance stays that of coordinates. What an error of a heading does to a position
+        depends on where that is, and so it changes with the correction.
+        """
+        mean, P, n_robots = self._state.mean, self._state.covariance, len(self._motions)
+        headings = np.arange(2, 3 * n_robots, 3)
+        if self.errors == "invariant":
+            is_place = np.ones(len(mean) // 3, bool)
+            is_place[n_robots : self._first_landmark // 3] = False  # gains
+            of = np.concatenate([np.arange(n_robots), self._placed_by])
+            before, turn = mean.reshape(-1, 3)[is_place, :2], by[headings[of]][:, None]
+            shift = by.reshape(-1, 3)[is_place, :2] - turn * _quarter_turned(before)
+            moved = _turned(before, turn) + _carried(shift, turn) - before
+            by = by.copy()
+            by.reshape(-1, 3)[is_place, :2] = moved
+            arms = np.zeros((len(is_place), 3, n_robots))
+            arms[np.flatnonzero(is_place), :2, of] = _quarter_turned(moved)
+            D = arms.reshape(-1, n_robots)
+            change = D @ (P[headings] + 0.5 * P[np.ix_(headings, headings)] @ D.T)
+            P += change + change.T
+        mean += by
+        for row in headings:
+            mean[row] = wrap(float(mean[row]))
 
     def _predict(self, robot: int, landmarks: Array) -> tuple[Array, Array, Array]:
-        """Predicted points of landmarks (K, 3) and their derivatives by the errors."""
-        predicted, of_pose, of_landmark = self._camera.predict(
-            self._state.mean[_own(robot)], landmarks
-        )
-        if self.invariant:
-            of_pose = of_pose * [1.0, 1.0, 0.0]
-        return predicted, of_pose, of_landmark
-
-    def _pose_covariance(self, robot: int) -> Array:
-        """Covariance (3, 3) of the coordinates of a robot's pose."""
-        P = self._state.covariance[_own(robot), _own(robot)]
-        if not self.invariant:
-            return P
-        by_error = np.eye(3)
-        by_error[:2, 2] = _quarter_turned(self._state.mean[:3])[:2]
-        covariance: Array = by_error @ P @ by_error.T
-        return covariance
+        """Predicted points of landmarks (K, 3) and their derivatives by pose and landmark."""
+        return self._camera.predict(self._state.mean[_own(robot)], landmarks)
 
     def _create(self, robot: int, points: Array) -> None:
         """Append landmarks at points (K, 3), gil2008, eqs. (16)-(18), with their correlations."""
@@ -416,6 +377,7 @@ class EkfSlam(EkfSlamOptions, TeamEstimator):
         C_T = of_landmark.transpose(0, 2, 1)
         R = self._camera.innovation(predicted, points)[1]
         self._state.extend(own, -(C_T @ of_pose), placed, C_T @ R @ of_landmark)
+        self._placed_by = np.append(self._placed_by, np.full(len(points), robot))
 
     def _sight(self, sightings: Sightings, frame: Frame, frames: Sequence[Frame]) -> None:
         """Update by a robot's sightings of others that have a Frame at this instant too."""
@@ -487,13 +449,18 @@ def _own(robot: int) -> slice:
 
 
 def _quarter_turned(points: Array) -> Array:
-    """Points (..., 3) turned by a quarter about the map's origin, level: d(R(a) x) / da at 0."""
-    x, y = points[..., 0], points[..., 1]
-    return np.stack([-y, x, np.zeros_like(x)], axis=-1)
+    """Points (..., 2) turned by a quarter about the map's origin: d(R(a) x) / da at 0."""
+    return np.stack([-points[..., 1], points[..., 0]], axis=-1)
 
 
-def _exponential(turn_rad: float) -> tuple[Array, Array]:
-    """R and V (2, 2) of exp: positions become R x + V e."""
-    cos, sin = math.cos(turn_rad), math.sin(turn_rad)
-    along, across = np.sinc(turn_rad / math.pi), (1.0 - cos) / turn_rad if turn_rad else 0.0
-    return np.array([[cos, -sin], [sin, cos]]), np.array([[along, -across], [across, along]])
+def _turned(points: Array, turn_rad: Array) -> Array:
+    """R(a) x of points (n, 2) and turns (n, 1)."""
+    turned: Array = np.cos(turn_rad) * points + np.sin(turn_rad) * _quarter_turned(points)
+    return turned
+
+
+def _carried(shift: Array, turn_rad: Array) -> Array:
+    """V(a) e of shifts (n, 2) at turns (n, 1), the shift of the exponential of both."""
+    half = np.sinc(turn_rad / (2.0 * np.pi))
+    carried: Array = half * _turned(shift, turn_rad / 2.0)
+    return carried

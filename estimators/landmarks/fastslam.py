@@ -67,7 +67,9 @@ class FastSLAM(FastSlamOptions, TeamEstimator):
 
     Notes
     -----
-    Belief mean and covariance are those of the weighted particles. Extras: `particles` (M, 3) and
+    Belief mean and covariance are those of the weighted particles. A lone robot's start is not
+    drawn: nothing it sees tells of its error, whose covariance is added, turned along the path.
+    Extras: `particles` (M, 3) and
     `log_weights` (M,) as of the last image; `ess`; `resampled`, after these were taken; `best`
     (3,), the pose of the particle of greatest accumulated log weight, carried along the ancestry,
     eq. (20); at an image `associations` (K,) of that particle: for each observation, counted from
@@ -101,7 +103,7 @@ class FastSLAM(FastSlamOptions, TeamEstimator):
         for start, wheels in zip(starts, dead_reckoning(self, priors), strict=True):
             start = required(start, "fastslam needs the starts of all robots; ekf_slam does not")
             path = ParticlePath(wheels, self.slip_dof, mount, n, n_blocks)
-            path.scatter(start, rng)
+            path.scatter(start, rng, draws_start=len(priors) > 1)
             self._paths.append(path)
         self._log_weights, self._accumulated = np.zeros((2, n))
         for path in self._paths:
@@ -136,7 +138,7 @@ class FastSLAM(FastSlamOptions, TeamEstimator):
     def _belief(self, frame: Frame, extras: dict[str, Any]) -> Belief:
         """Belief of a Frame's robot; the Frame is noted for `finish`."""
         path = self._paths[frame.robot]
-        belief = path.belief.then(path.rolled)
+        belief = path.place(path.belief.then(path.rolled))
         extras |= {
             "particles": path.drawn,
             "log_weights": self._log_weights,
@@ -217,8 +219,8 @@ class FastSLAM(FastSlamOptions, TeamEstimator):
     def finish(self) -> Estimate:
         """Path of the lineage of greatest accumulated weight, gil2008, eq. (20).
 
-        The covariances are those of all weighted lineages. They are zero where all lineages share
-        one ancestor: a sign of particle depletion; the path is not known exactly.
+        The covariances are twice those of all weighted lineages, as the path is a draw from them;
+        where lineages share an ancestor, what the filter knew then stands for their spread.
         """
         return self.finish_team()[0]
 
@@ -251,7 +253,7 @@ class FastSLAM(FastSlamOptions, TeamEstimator):
         weights = normalize(self._log_weights)
         self._ess = 1.0 / float(weights @ weights)
         for path in self._paths:
-            path.belief = Gaussian(*ekf.moments(path.drawn, weights))
+            path.weigh(weights)
 
     def _associate(self, path: ParticlePath, image: Image, spread: Array) -> Ints:
         """Slots (K, M) of each particle, -1 for new ones."""

@@ -45,18 +45,34 @@ class ParticlePath:
         self._wheels, self._slip_dof, self._n = wheels, slip_dof, n_particles
         self._mount, self.state = packed_mount(mount), ekf.new_state(n_blocks)
         self._lineages = Lineages(n_particles)
+        self._filtered: list[Array] = []  # covariance of each draw under its weights then
         # of each Frame: its stamp, the draw it follows, and the motion since
         self._frames: list[tuple[float, int, Array]] = []
 
-    def scatter(self, start: Gaussian, rng: np.random.Generator) -> None:
-        """Draw the particles from the start."""
-        turned = rotate(start.covariance, -float(start.mean[2]))
+    def scatter(self, start: Gaussian, rng: np.random.Generator, draws_start: bool) -> None:
+        """Draw the particles from the start, or put all at its mean: `place` adds its covariance.
+
+        No image tells of an error of a lone robot's start, which turns and shifts path and map as a
+        whole; drawn, its spread would be lost as particles are resampled.
+        """
+        none = np.zeros((3, 3))
+        spread, undrawn = (start.covariance, none) if draws_start else (none, start.covariance)
+        self._start = Gaussian(start.mean, undrawn)
+        turned = rotate(spread, -float(start.mean[2]))
         normals = rng.standard_normal((3, len(self.state) * ekf.LANES))
         drawn = se2.compose(start.mean, (root((turned + turned.T) / 2.0) @ normals).T)
         headings = drawn[:, 2]
         self.poses = np.stack([*drawn.T, np.cos(headings), np.sin(headings)])
-        self.rolled, self.root, self.belief = STILL, np.zeros((3, 2)), start
+        self.rolled, self.root = STILL, np.zeros((3, 2))
         self.stretch = np.ones(self.poses.shape[1])
+
+    def place(self, belief: Gaussian) -> Gaussian:
+        """Add to a belief the covariance that an error of the start gives it, if not drawn."""
+        by_start = np.eye(3)
+        x, y, _ = belief.mean - self._start.mean
+        by_start[:2, 2] = -y, x
+        covariance = belief.covariance + by_start @ self._start.covariance @ by_start.T
+        return Gaussian(belief.mean, covariance)
 
     def roll(self, frame: Frame) -> None:
         """Add the Frame's arc to the motion that is not yet drawn."""
@@ -96,7 +112,13 @@ class ParticlePath:
         self.drawn = np.ascontiguousarray(self.poses[:3, : self._n].T)
         self.drawn[:, 2] = se2.wrap(self.drawn[:, 2])
         self._lineages.append(self.drawn)
+        self._filtered.append(np.zeros((3, 3)))
         self.rolled = STILL
+
+    def weigh(self, weights: Array) -> None:
+        """Take the moments of the last draw under weights (M,)."""
+        self.belief = Gaussian(*ekf.moments(self.drawn, weights))
+        self._filtered[-1] = self.belief.covariance
 
     def note(self, stamp: float) -> None:
         """Note a Frame."""
@@ -109,14 +131,21 @@ class ParticlePath:
         self.drawn = self.drawn[ancestors]
 
     def revised(self, best: int, weights: Array, known_map: dict[str, Array | Ints]) -> Estimate:
-        """Path of one particle, with the covariances of all weighted ones."""
+        """Path of one particle, with the covariances of its error.
+
+        The path is a draw from the posterior, so its error has twice the posterior's covariance:
+        the truth is another such draw. Two particles with one ancestor at some time say nothing of
+        the spread then; in their place stands the spread that the filter had.
+        """
         n = len(self._lineages)
         drawn: list[Gaussian] = []
-        for poses, rows in self._lineages.paths():
+        steps = zip(self._lineages.paths(), reversed(self._filtered), strict=True)
+        for (poses, rows), filtered in steps:
             by_row = np.bincount(rows, weights, minlength=len(poses)).astype(np.float64)
-            drawn.append(Gaussian(poses[rows[best]], ekf.moments(poses, by_row)[1]))
+            spread = ekf.moments(poses, by_row)[1] + float(by_row @ by_row) * filtered
+            drawn.append(Gaussian(poses[rows[best]], 2.0 * spread))
         beliefs = [
-            drawn[n - 1 - draw].then(Gaussian(since, np.zeros((3, 3))))
+            self.place(drawn[n - 1 - draw].then(Gaussian(since, np.zeros((3, 3)))))
             for _, draw, since in self._frames
         ]
         stamps = np.array([stamp for stamp, _, _ in self._frames])

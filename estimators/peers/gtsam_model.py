@@ -5,7 +5,7 @@ covariances of `StereoModel` (column, row and disparity) and of the wheels.
 """
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -45,6 +45,9 @@ class Isam2Options(GtsamOptions):
     """At how many updates that is looked at."""
     updates: Count = 1
     """Calls of `update` at every image."""
+    factorization: Literal["cholesky", "qr"] = "cholesky"
+    """How linear systems are solved. `qr` is slower, and holds where `cholesky` ends the run since
+    some noise is far smaller than the rest, as that of wheels that have not turned yet."""
 
 
 class GtsamModel:
@@ -177,6 +180,7 @@ class Isam2:
         params = gtsam.ISAM2Params()
         params.setRelinearizeThreshold(believed.relinearize_threshold)
         params.relinearizeSkip = believed.relinearize_skip
+        params.setFactorization(believed.factorization.upper())
         self._isam = gtsam.ISAM2(params)
         start, (graph, values) = self.belief, self.model.graph_and_values()
         self.model.add_start(graph, Gaussian(start.mean, start.covariance + FLOOR))

@@ -86,7 +86,7 @@ def reference_of(recording: Recording, on_step: OnStep = None) -> Reference:
     name = cameras[0]
     prior = Prior(recording.robot, recording.sensors, np.zeros(3), _START)
     # online, and gated: a batch that starts from wrong wheels and misread landmarks ends anywhere
-    mapper = EkfSlam(kr=3e-3, kl=3e-3, errors="invariant", gate_probability=1e-6, stereo=name)
+    mapper = EkfSlam(kr=3e-3, kl=3e-3, gate_probability=1e-6, stereo=name)
     found, _ = run_over(recording, mapper, prior, np.random.default_rng(0), on_step=on_step)
     rows = np.flatnonzero(np.isin(found.stamps, recording.log(name).stamps))
     stamps = found.stamps[rows]

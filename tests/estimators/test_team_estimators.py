@@ -321,7 +321,7 @@ def test_a_robot_gains_nothing_from_itself():
         again = dataclasses.replace(frame, wheel_increments_m=np.zeros(2), duration_s=0.0)
         beliefs = [twice.step_team([each])[0] for each in (frame, again)]
     determinants = [np.linalg.det(c) for c in (beliefs[-1].covariance, alone.covariances[-1])]
-    assert determinants[0] < 0.95 * determinants[1]
+    assert determinants[0] < 0.995 * determinants[1]
 
 
 def test_kinds_of_communication():
@@ -374,12 +374,6 @@ def test_robots_of_a_team_carry_the_same_sensors():
     bare = {k: v for k, v in priors[0].sensors.items() if k != "robots"}
     with pytest.raises(InputError, match=r"estimator.robots: no sensor named robots"):
         EkfSlam(**SEEING).reset_team([dataclasses.replace(priors[0], sensors=bare)], None)
-
-
-def test_invariant_errors_are_of_one_robot():
-    team = fake_team(0, n_frames=5)
-    with pytest.raises(InputError, match=r"set estimator\.errors=coordinates"):
-        answers(lambda: EkfSlam(errors="invariant", **WHEELS), team, priors_of(team))
 
 
 def test_repeats_are_counted_for_each_robot():

@@ -50,6 +50,7 @@ from experiments.runs.evaluate import run_over, status_of
 from experiments.runs.experiment import Experiment
 from experiments.runs.processes import is_interrupt
 from experiments.runs.row import Outcome, Row, Status
+from experiments.studies.installed import why_absent
 from experiments.studies.peers.settings import (
     CAP_M,
     COMPETING,
@@ -63,7 +64,7 @@ from experiments.studies.peers.settings import (
     WEAN_STARTS,
     WHEELS,
 )
-from experiments.studies.peers.version import missing, sensor_of, version_of
+from experiments.studies.peers.version import sensor_of, version_of
 from experiments.studies.real_logs.grid_match import beam_points
 from experiments.sweeps.averages import MIN_UNITS
 from experiments.sweeps.plan import plan_experiments
@@ -368,7 +369,7 @@ def run_method(case: Case, one: Experiment) -> list[tuple[Row, Errors | None]]:
         "kind": case.kind,
         "n_readings": n_readings,
     }
-    if why := missing(one):
+    if why := why_absent(one):
         return [({**row, "status": "missing", "reason": why}, None)]
     row["project"] = version_of(name)
     try:

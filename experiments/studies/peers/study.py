@@ -9,15 +9,15 @@ from experiments.judging.logs import why_missing
 from experiments.judging.remake import Cells, Remake
 from experiments.judging.results import Profile, Results
 from experiments.runs.columns import REVISED
-from experiments.runs.console import warn
 from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Outcome, Row
+from experiments.studies.installed import find_absent, why_absent
 from experiments.studies.peers import edges
 from experiments.studies.peers.logs import LOGS, ordered, over_log
 from experiments.studies.peers.own_logs import over_folder as over_folder
 from experiments.studies.peers.settings import CLASSES, COMPETING
-from experiments.studies.peers.version import missing, sensor_of, version_of
+from experiments.studies.peers.version import sensor_of, version_of
 from experiments.sweeps.averages import MIN_UNITS, averages
 from experiments.sweeps.plan import plan_experiments
 from experiments.sweeps.tune import FAILED_M
@@ -41,10 +41,7 @@ def run(profile: Profile, out: Results, on_progress: Progress) -> None:
     """
     fewer = [] if profile is Profile.FULL else ["seed=1000"]
     experiments = list(plan_experiments(["study=peers", *fewer]))
-    one_each = {experiment.estimator_name: experiment for experiment in experiments}
-    absent = {name: why for name, experiment in one_each.items() if (why := missing(experiment))}
-    for name, reason in absent.items():
-        warn(f"{name}: left out, {reason}")
+    absent = find_absent(experiments)
     present = [e for e in experiments if e.estimator_name not in absent]
     drives = group_by(present, lambda e: (e.label("board"), e.seed))
     made = tables_of(runs, [(drive,) for drive in drives], on_progress)
@@ -77,7 +74,7 @@ def remake(_table: str, row: Cells) -> Remake | None:
     given = [f"study/board={row['board']}", f"seed={row['seed']:.0f}"]
     for one in plan_experiments(["study=peers", *given]):
         if (one.label("arm"), one.estimator_name) == (row["arm"], row["estimator"]):
-            return None if missing(one) else (runs, ([one],))
+            return None if why_absent(one) else (runs, ([one],))
     return None
 
 

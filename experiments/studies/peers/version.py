@@ -1,26 +1,9 @@
-"""What a method of the study is: whose, of which version, what it reads, and whether it is here."""
+"""What a method of the study is: whose, of which version, and what it reads."""
 
 import importlib.metadata
 import subprocess
 
-from estimators.peers import MissingPackageError
-from experiments.runs.experiment import Experiment
 from experiments.studies.peers.settings import LASER, PACKAGES, READS, TUNED
-
-
-def missing(experiment: Experiment) -> str:
-    """Why a peer cannot run here; empty if it can.
-
-    Raises
-    ------
-    InputError
-        If the configuration is wrong.
-    """
-    try:
-        experiment.check()
-    except MissingPackageError as error:
-        return str(error)
-    return ""
 
 
 def sensor_of(name: str) -> str:

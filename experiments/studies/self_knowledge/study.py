@@ -22,6 +22,7 @@ from experiments.runs.evaluate import run_over
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import Row
 from experiments.runs.seeds import stream
+from experiments.studies.installed import installed, why_absent
 from experiments.studies.self_knowledge.planted import lift_wheels
 from experiments.studies.self_knowledge.wean import over_wean
 from experiments.sweeps.plan import plan_experiments
@@ -30,7 +31,6 @@ from sim.recording import Recording
 OFF = np.array([2.0, 2.0, 1.0])  # of a misread start, m, m, rad
 PLANTED = ("nothing", "start", "wheels")
 _FEWER, _QUIET = "seed=range(1000,1004)", "study=self_knowledge_quiet"
-_FIRST_QUIET = 10_000  # seed
 _SCORES = (
     "ate_rmse_m",
     "heading_rmse_rad",
@@ -51,11 +51,11 @@ def run(profile: Profile, out: Results, on_progress: Progress) -> None:
     Parameters
     ----------
     profile
-        `quick`: 4 drives of each method; `full`: 250 of `mcl`, 60 of the others, and 800 longer
+        `quick`: 4 drives of each method; `full`: 250 of `mcl`, 60 of the others, and 760 longer
         ones of `mcl` in which nothing is planted.
     """
     is_full = profile is Profile.FULL
-    runs = plan_experiments(["study=self_knowledge", *([] if is_full else [_FEWER])])
+    runs = installed(plan_experiments(["study=self_knowledge", *([] if is_full else [_FEWER])]))
     jobs: list[list[object]] = [[part] for part in group_by(runs, lambda one: one.seed)]
     if is_full:
         jobs += [[[one], PLANTED[:1]] for one in plan_experiments([_QUIET])]
@@ -68,13 +68,13 @@ PARTS = {"wean": over_wean}
 REMADE = {"said": 60.0, "consistency": 60.0}  # the others follow from them
 
 
-def remake(_table: str, row: Cells) -> Remake:
-    """The call that makes a row again."""
-    seed = f"seed={row['seed']:.0f}"
-    study = _QUIET if row["seed"] >= _FIRST_QUIET else "study=self_knowledge"
-    runs = plan_experiments([study, seed])
+def remake(_table: str, row: Cells) -> Remake | None:
+    """The call that makes a row again; None if its method is not here."""
+    study = _QUIET if row.get("part") == "quiet" else "study=self_knowledge"
+    runs = plan_experiments([study, f"seed={row['seed']:.0f}"])
     own = [one for one in runs if one.estimator_name == row["method"]]
-    return said, (own, [str(row.get("planted", PLANTED[0]))])
+    planted = [str(row.get("planted", PLANTED[0]))]
+    return None if any(map(why_absent, own)) else (said, (own, planted))
 
 
 def said(runs: Sequence[Experiment], planted: Sequence[str] = PLANTED) -> Tables:
@@ -83,10 +83,11 @@ def said(runs: Sequence[Experiment], planted: Sequence[str] = PLANTED) -> Tables
     Returns
     -------
     Tables
-        `said`, a row a loss or window, and `consistency`, a row an answer in a drive as it is.
+        `said`, a row a loss or window, and `consistency`, a row an answer in a drive as it is,
+        but for those of the quiet hours, which are longer.
     """
     recording = runs[0].recording()
-    truth, rows, known = recording.truth_at(recording.frame_stamps), list[Row](), list[Row]()
+    rows, known = list[Row](), list[Row]()
     for one in runs:
         for what in planted:
             prior = one.prior(recording)
@@ -96,13 +97,14 @@ def said(runs: Sequence[Experiment], planted: Sequence[str] = PLANTED) -> Tables
             rng = stream(one.seed, f"estimator/{one.estimator_name}/{what}")
             online, revised = run_over(driven, one.estimator(), prior, rng, ("lost",))
             labels: Row = {"method": one.estimator_name, "planted": what, "seed": one.seed}
+            truth, part = recording.truth_at(online.stamps), one.label("part")
             kinds = evidence_of(truth, online)._asdict()
             rows += [
-                {**labels, "kind": kind, "number": number, "signal": float(value)}
+                {**labels, "part": part, "kind": kind, "number": number, "signal": float(value)}
                 for kind, values in kinds.items()
                 for number, value in enumerate(values)
             ]
-            if what == PLANTED[0]:
+            if what == PLANTED[0] and part == "planted":
                 known += [
                     consistency(recording, answer, labels) for answer in (online, revised) if answer
                 ]
@@ -116,13 +118,12 @@ def consistency(recording: Recording, answer: Estimate, labels: Row) -> Row:
 
 
 def covered(table: pd.DataFrame) -> pd.DataFrame:
-    """Means of the scores of `consistency` by method and answer, over drives of one length.
+    """Means of the scores of `consistency` by method and answer.
 
     The interval of the share inside 95 % is the bootstrap over drives.
     """
     rows = list[Row]()
-    usual = table[table["seed"] < _FIRST_QUIET]
-    for (method, answer), own in usual.dropna().groupby(["method", "answer"]):
+    for (method, answer), own in table.dropna().groupby(["method", "answer"]):
         inside = own["inside_95_share"].to_numpy(float)
         of = bootstrap_interval(inside, lambda a: float(a.mean()), np.random.default_rng(0))
         labels: Row = {"method": method, "answer": answer, "drives": len(own)}

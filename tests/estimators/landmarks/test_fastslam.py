@@ -9,7 +9,7 @@ from estimators.base import run
 from estimators.landmarks import fastslam
 from estimators.landmarks.fastslam import FastSLAM
 from estimators.odometry import Odometry
-from experiments.evaluation.metrics import position_errors_m, rms
+from experiments.evaluation.metrics import position_errors_m, rms, score
 from experiments.gate.conform import check_estimator
 from sim.errors import InputError
 from sim.recording import Frame
@@ -118,6 +118,24 @@ def test_both_proposals_have_the_same_posterior():
     assert few.extras["ess"][-1] > 1000
     assert np.all(np.abs(few.means[-1] - many.means[-1]) < 0.2 * sigma)
     assert np.allclose(np.sqrt(np.diagonal(few.covariances[-1])), sigma, rtol=0.2)
+
+
+def test_errors_of_both_answers_are_within_their_covariances():
+    """Of starts in doubt, over drives long enough to leave few ancestors of the start."""
+    scores = {"online": [], "revised": []}
+    for seed in range(12):
+        recording = circle(seed, n_frames=160, kr=1e-4, kl=1e-4, start=(8.0, 6.0, 0.4))
+        prior, rng = tracking_prior(recording, (0.05, 0.05, 0.05)), np.random.default_rng([seed, 1])
+        start = rng.multivariate_normal(prior.mean, prior.covariance)
+        estimator = FastSLAM(kr=1e-4, kl=1e-4, n_particles=50)
+        online = run(estimator, recording, dataclasses.replace(prior, mean=start), rng)
+        for answer in (online, estimator.finish()):
+            known = score(recording, answer)
+            scores[answer.kind].append([known["inside_95_share"], known["nees_mean"]])
+    for kind in scores:
+        inside, squares = np.mean(scores[kind], axis=0)
+        assert inside > 0.85, kind
+        assert 1.0 < squares < 4.5, kind
 
 
 def test_shared_and_contiguous_maps_give_the_same_bits(recording):

@@ -11,6 +11,7 @@ from scipy import stats
 from experiments import reproduce
 from experiments.judging.results import Profile, Results
 from experiments.runs.experiment import Experiment
+from experiments.studies.installed import why_absent
 from experiments.studies.peers import figures, study
 from experiments.studies.peers.settings import CLASSES
 from experiments.studies.peers.version import is_ours
@@ -121,8 +122,8 @@ def test_its_figure(tmp_path):
 def test_what_is_missing_is_told(tmp_path, monkeypatch):
     absent = Experiment.compose(["estimator=peers/mrpt_icp", "sensors=hokuyo"])
     monkeypatch.chdir(tmp_path)
-    assert "make peers" in study.missing(absent)
-    assert study.missing(Experiment.compose(["estimator=odometry"])) == ""
+    assert "make peers" in why_absent(absent)
+    assert why_absent(Experiment.compose(["estimator=odometry"])) == ""
 
 
 @pytest.mark.slow

@@ -14,9 +14,9 @@ from experiments.evaluation.relations import relation_scores
 from experiments.judging.logs import freiburg, relations_of, why_missing
 from experiments.judging.results import Results
 from experiments.runs.calibration import Calibration, Slip, Wheels, write_calibration
+from experiments.studies.installed import why_absent
 from experiments.studies.peers import figures, logs, own_logs
 from experiments.studies.peers.settings import CAP_M, LASER, MAP, WEAN_STARTS
-from experiments.studies.peers.version import missing
 from sim import se2
 from sim.errors import InputError
 from sim.formats.relations import Relations, write_relations
@@ -116,7 +116,7 @@ def test_evo_finds_the_same_errors(folder):
 
     case = own_logs.own_case(folder / "hall.npz")
     for one in methods(case, "odometry", "ekf_icp", "icp_odometry", "graph_slam", "small_gicp"):
-        if missing(one):
+        if why_absent(one):
             continue
         rng = np.random.default_rng(0)
         path, _ = logs.run_over(case.recording, one.estimator(), case.prior, rng)
