@@ -29,6 +29,7 @@ from experiments.sweeps.plan import plan_experiments
 from sim.recording import Recording
 
 OFF = np.array([2.0, 2.0, 1.0])  # of a misread start, m, m, rad
+FAILED = "failed"  # in place of what a method said of losses and windows
 PLANTED = ("nothing", "start", "wheels")
 _FEWER, _QUIET = "seed=range(1000,1004)", "study=self_knowledge_quiet"
 _SCORES = (
@@ -83,8 +84,8 @@ def said(runs: Sequence[Experiment], planted: Sequence[str] = PLANTED) -> Tables
     Returns
     -------
     Tables
-        `said`, a row a loss or window, and `consistency`, a row an answer in a drive as it is,
-        but for those of the quiet hours, which are longer.
+        `said`, a row a loss, a window or a run that failed, and `consistency`, a row an answer in
+        a drive as it is, but for those of the quiet hours, which are longer.
     """
     recording = runs[0].recording()
     rows, known = list[Row](), list[Row]()
@@ -95,10 +96,14 @@ def said(runs: Sequence[Experiment], planted: Sequence[str] = PLANTED) -> Tables
                 prior = dataclasses.replace(prior, mean=prior.mean + OFF)
             driven = lift_wheels(recording) if what == "wheels" else recording
             rng = stream(one.seed, f"estimator/{one.estimator_name}/{what}")
-            online, revised = run_over(driven, one.estimator(), prior, rng, ("lost",))
+            part = one.label("part")
             labels: Row = {"method": one.estimator_name, "planted": what, "seed": one.seed}
-            truth, part = recording.truth_at(online.stamps), one.label("part")
-            kinds = evidence_of(truth, online)._asdict()
+            try:
+                online, revised = run_over(driven, one.estimator(), prior, rng, ("lost",))
+            except RuntimeError:  # how GTSAM ends where it has no solution
+                rows.append({**labels, "part": part, "kind": FAILED, "number": 0})
+                continue
+            kinds = evidence_of(recording.truth_at(online.stamps), online)._asdict()
             rows += [
                 {**labels, "part": part, "kind": kind, "number": number, "signal": float(value)}
                 for kind, values in kinds.items()
@@ -139,6 +144,7 @@ def curves(table: pd.DataFrame) -> pd.DataFrame:
         both = (own.loc[own["kind"] == kind, "signal"].to_numpy(float) for kind in Evidence._fields)
         evidence = Evidence(*both)
         rows = pd.DataFrame(alarm_curve([evidence]), columns=["threshold", "missed", "false_per_h"])
-        counts = {"losses": len(evidence.peaks), "quiet": len(evidence.quiet)}
+        failed = int((own["kind"] == FAILED).sum())
+        counts = {"losses": len(evidence.peaks), "quiet": len(evidence.quiet), "failed": failed}
         parts.append(rows.assign(method=method, **counts))
     return pd.concat(parts, ignore_index=True)

@@ -32,6 +32,22 @@ def test_a_misread_start_is_a_loss_that_odometry_misses(monkeypatch):
     assert line.get_label() == f"odometry ({len(losses)} losses)"
 
 
+def test_runs_that_fail_are_counted_apart(monkeypatch):
+    def fails(*_):
+        raise RuntimeError("Indeterminate linear system")
+
+    driven = circle(seed=1, n_frames=24)
+    monkeypatch.setattr(Experiment, "recording", lambda self: driven)
+    monkeypatch.setattr(study, "run_over", fails)
+    one = Experiment.compose(["study=self_knowledge", "estimator=odometry"])
+    made = study.said([one])
+    assert [row["kind"] for row in made["said"]] == ["failed"] * 3
+    assert not made["consistency"]
+    quiet = {"method": "odometry", "kind": "quiet", "signal": 0.1}
+    curve = study.curves(pd.DataFrame([*made["said"], quiet]))
+    assert set(curve["failed"]) == {3}
+
+
 def test_the_share_inside_is_the_mean_over_drives():
     scores = dict.fromkeys(study._SCORES, 1.0)
     shares = {1000: 0.9, 1001: 1.0}
