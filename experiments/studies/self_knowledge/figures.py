@@ -4,6 +4,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
+from experiments.evaluation.alarm import Evidence, alarm_curve
 from experiments.judging.results import Results
 from experiments.studies.self_knowledge.planted import LIFTED
 from experiments.viewing.plotting import with_legend
@@ -14,13 +15,33 @@ _CONSISTENT = 0.90, 0.99  # share inside the ellipsoid of 95 % that passes
 
 def draw(results: Results) -> dict[str, Figure]:
     """Draw the study's figures."""
-    drawn = {"self_knowledge_alarms": draw_alarms(results.table("curve"))}
-    coverage, wean = (results.optional_table(name) for name in ("coverage", "wean"))
+    coverage, wean, quiet = (results.optional_table(n) for n in ("coverage", "wean", "quiet"))
+    curve = curves(pd.concat([results.table("said"), quiet]))
+    drawn = {"self_knowledge_alarms": draw_alarms(curve)}
     if coverage is not None:
         drawn["self_knowledge_coverage"] = draw_coverage(coverage)
     if wean is not None:
-        drawn["self_knowledge_wean"] = draw_wean(wean, results.table("curve"))
+        drawn["self_knowledge_wean"] = draw_wean(wean, curve)
     return drawn
+
+
+def curves(said: pd.DataFrame) -> pd.DataFrame:
+    """Share of losses missed against false alarms an hour, by method.
+
+    Parameters
+    ----------
+    said
+        Columns `method`, `kind` and `signal`: of losses, of windows without one, of failed runs.
+    """
+    parts = []
+    for method, own in said.groupby("method"):
+        both = (own.loc[own["kind"] == kind, "signal"].to_numpy(float) for kind in Evidence._fields)
+        evidence = Evidence(*both)
+        rows = pd.DataFrame(alarm_curve([evidence]), columns=["threshold", "missed", "false_per_h"])
+        failed = int((own["kind"] == "failed").sum())
+        counts = {"losses": len(evidence.peaks), "quiet": len(evidence.quiet), "failed": failed}
+        parts.append(rows.assign(method=method, **counts))
+    return pd.concat(parts, ignore_index=True)
 
 
 def draw_alarms(table: pd.DataFrame) -> Figure:

@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 
 from estimators.base import Estimate
-from experiments.evaluation.alarm import Evidence, alarm_curve, evidence_of
+from experiments.evaluation.alarm import evidence_of
 from experiments.evaluation.metrics import score
 from experiments.evaluation.statistics import bootstrap_interval
 from experiments.judging.jobs import Progress, Tables, group_by, tables_of
@@ -29,7 +29,6 @@ from experiments.sweeps.plan import plan_experiments
 from sim.recording import Recording
 
 OFF = np.array([2.0, 2.0, 1.0])  # of a misread start, m, m, rad
-FAILED = "failed"  # in place of what a method said of losses and windows
 PLANTED = ("nothing", "start", "wheels")
 _FEWER, _QUIET = "seed=range(1000,1004)", "study=self_knowledge_quiet"
 _SCORES = (
@@ -46,33 +45,36 @@ _SCORES = (
 def run(profile: Profile, out: Results, on_progress: Progress) -> None:
     """Run the study and write its tables.
 
-    They are: what each method said in losses and without one, and its curve of alarms; of each
-    drive in which nothing is planted how it knew its error, and the means of that.
+    They are: what each method said in losses and without one; of each drive in which nothing is
+    planted how it knew its error, and the means of that.
 
     Parameters
     ----------
     profile
-        `quick`: 4 drives of each method; `full`: 250 of `mcl`, 60 of the others, and 760 longer
-        ones of `mcl` in which nothing is planted.
+        `quick`: 4 drives of each method; `full`: 250 of `mcl`, 60 of the others.
     """
     is_full = profile is Profile.FULL
     runs = installed(plan_experiments(["study=self_knowledge", *([] if is_full else [_FEWER])]))
-    jobs: list[list[object]] = [[part] for part in group_by(runs, lambda one: one.seed)]
-    if is_full:
-        jobs += [[[one], PLANTED[:1]] for one in plan_experiments([_QUIET])]
-    made = tables_of(said, jobs, on_progress)
-    curve, coverage = curves(made["said"]), covered(made["consistency"])
-    out.write_tables(**made, curve=curve, coverage=coverage)
+    drives = group_by(runs, lambda one: one.seed)
+    made = tables_of(said, [(drive,) for drive in drives], on_progress)
+    out.write_tables(**made, coverage=covered(made["consistency"]))
 
 
-PARTS = {"wean": over_wean}
-REMADE = {"said": 60.0, "consistency": 60.0}  # the others follow from them
+def over_quiet(_profile: Profile, on_progress: Progress) -> dict[str, pd.DataFrame]:
+    """The table of what `mcl` said over hours in which nothing is planted."""
+    return tables_of(quiet, [(one,) for one in plan_experiments([_QUIET])], on_progress)
 
 
-def remake(_table: str, row: Cells) -> Remake | None:
+PARTS = {"quiet": over_quiet, "wean": over_wean}
+REMADE = {"said": 60.0, "consistency": 60.0, "quiet": 15.0}  # the others follow from them
+
+
+def remake(table: str, row: Cells) -> Remake | None:
     """The call that makes a row again; None if its method is not here."""
-    study = _QUIET if row.get("part") == "quiet" else "study=self_knowledge"
-    runs = plan_experiments([study, f"seed={row['seed']:.0f}"])
+    seed = f"seed={row['seed']:.0f}"
+    if table == "quiet":
+        return quiet, tuple(plan_experiments([_QUIET, seed]))
+    runs = plan_experiments(["study=self_knowledge", seed])
     own = [one for one in runs if one.estimator_name == row["method"]]
     planted = [str(row.get("planted", PLANTED[0]))]
     return None if any(map(why_absent, own)) else (said, (own, planted))
@@ -85,7 +87,7 @@ def said(runs: Sequence[Experiment], planted: Sequence[str] = PLANTED) -> Tables
     -------
     Tables
         `said`, a row a loss, a window or a run that failed, and `consistency`, a row an answer in
-        a drive as it is, but for those of the quiet hours, which are longer.
+        a drive as it is.
     """
     recording = runs[0].recording()
     rows, known = list[Row](), list[Row]()
@@ -96,24 +98,28 @@ def said(runs: Sequence[Experiment], planted: Sequence[str] = PLANTED) -> Tables
                 prior = dataclasses.replace(prior, mean=prior.mean + OFF)
             driven = lift_wheels(recording) if what == "wheels" else recording
             rng = stream(one.seed, f"estimator/{one.estimator_name}/{what}")
-            part = one.label("part")
             labels: Row = {"method": one.estimator_name, "planted": what, "seed": one.seed}
             try:
                 online, revised = run_over(driven, one.estimator(), prior, rng, ("lost",))
             except RuntimeError:  # how GTSAM ends where it has no solution
-                rows.append({**labels, "part": part, "kind": FAILED, "number": 0})
+                rows.append({**labels, "kind": "failed", "number": 0})
                 continue
             kinds = evidence_of(recording.truth_at(online.stamps), online)._asdict()
             rows += [
-                {**labels, "part": part, "kind": kind, "number": number, "signal": float(value)}
+                {**labels, "kind": kind, "number": number, "signal": float(value)}
                 for kind, values in kinds.items()
                 for number, value in enumerate(values)
             ]
-            if what == PLANTED[0] and part == "planted":
+            if what == PLANTED[0]:
                 known += [
                     consistency(recording, answer, labels) for answer in (online, revised) if answer
                 ]
     return {"said": rows, "consistency": known}
+
+
+def quiet(one: Experiment) -> Tables:
+    """What a run said in a drive in which nothing is planted."""
+    return {"quiet": said([one], PLANTED[:1])["said"]}
 
 
 def consistency(recording: Recording, answer: Estimate, labels: Row) -> Row:
@@ -135,16 +141,3 @@ def covered(table: pd.DataFrame) -> pd.DataFrame:
         means = {key: float(own[key].mean()) for key in _SCORES}
         rows.append({**labels, **means, "low": of.low, "high": of.high})
     return pd.DataFrame(rows)
-
-
-def curves(table: pd.DataFrame) -> pd.DataFrame:
-    """Share of losses missed against false alarms an hour, by method."""
-    parts = []
-    for method, own in table.groupby("method"):
-        both = (own.loc[own["kind"] == kind, "signal"].to_numpy(float) for kind in Evidence._fields)
-        evidence = Evidence(*both)
-        rows = pd.DataFrame(alarm_curve([evidence]), columns=["threshold", "missed", "false_per_h"])
-        failed = int((own["kind"] == FAILED).sum())
-        counts = {"losses": len(evidence.peaks), "quiet": len(evidence.quiet), "failed": failed}
-        parts.append(rows.assign(method=method, **counts))
-    return pd.concat(parts, ignore_index=True)

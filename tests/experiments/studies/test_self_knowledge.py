@@ -26,7 +26,7 @@ def test_a_misread_start_is_a_loss_that_odometry_misses(monkeypatch):
     losses = table[table["kind"] == "peaks"]
     assert "start" in set(losses["planted"])
     assert "nothing" not in set(losses["planted"])
-    curve = study.curves(table)
+    curve = figures.curves(table)
     assert curve["missed"].iloc[-1] == 1.0  # without alarms
     line = figures.draw_alarms(curve).axes[0].get_lines()[0]
     assert line.get_label() == f"odometry ({len(losses)} losses)"
@@ -44,7 +44,7 @@ def test_runs_that_fail_are_counted_apart(monkeypatch):
     assert [row["kind"] for row in made["said"]] == ["failed"] * 3
     assert not made["consistency"]
     quiet = {"method": "odometry", "kind": "quiet", "signal": 0.1}
-    curve = study.curves(pd.DataFrame([*made["said"], quiet]))
+    curve = figures.curves(pd.DataFrame([*made["said"], quiet]))
     assert set(curve["failed"]) == {3}
 
 
