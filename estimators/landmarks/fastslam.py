@@ -23,6 +23,7 @@ from sim.options import NonNegative, Positive, options
 from sim.recording import Frame
 
 Proposal = Literal["motion", "optimal"]
+Start = Literal["apart", "drawn"]
 
 _MOST_PARTICLES = 100_000  # a map of 100 landmarks each is about 1 GB
 _PLACING = 4  # observations after which the proposal is linearised again
@@ -50,6 +51,11 @@ class FastSlamOptions(LandmarkSlamOptions):
     maps: Maps = "shared"
     """`shared` or `contiguous`, see `estimators.landmarks.particle_maps.LandmarkMaps`: the same
     bits, at different speeds."""
+    start: Start = "apart"
+    """Where the particles of a lone robot begin. `apart`: at the mean of its start; its covariance
+    is added to theirs, turned along the path, as nothing that the robot sees tells of an error of
+    the start. `drawn`: as the start's covariance has them, and as a team's are; each resampling
+    then takes a part of that spread away."""
     slip_dof: Positive | None = None
     """Degrees of freedom of the slip, which is then Student's t: wheels that slip in bursts leave a
     normal cloud behind. Each particle draws its own scale at each image. null: normal."""
@@ -67,9 +73,8 @@ class FastSLAM(FastSlamOptions, TeamEstimator):
 
     Notes
     -----
-    Belief mean and covariance are those of the weighted particles. A lone robot's start is not
-    drawn: nothing it sees tells of its error, whose covariance is added, turned along the path.
-    Extras: `particles` (M, 3) and
+    Belief mean and covariance are those of the weighted particles, and by default what the start
+    adds. Extras: `particles` (M, 3) and
     `log_weights` (M,) as of the last image; `ess`; `resampled`, after these were taken; `best`
     (3,), the pose of the particle of greatest accumulated log weight, carried along the ancestry,
     eq. (20); at an image `associations` (K,) of that particle: for each observation, counted from
@@ -103,7 +108,7 @@ class FastSLAM(FastSlamOptions, TeamEstimator):
         for start, wheels in zip(starts, dead_reckoning(self, priors), strict=True):
             start = required(start, "fastslam needs the starts of all robots; ekf_slam does not")
             path = ParticlePath(wheels, self.slip_dof, mount, n, n_blocks)
-            path.scatter(start, rng, draws_start=len(priors) > 1)
+            path.scatter(start, rng, draws_start=self.start == "drawn" or len(priors) > 1)
             self._paths.append(path)
         self._log_weights, self._accumulated = np.zeros((2, n))
         for path in self._paths:

@@ -76,7 +76,7 @@ DEFAULTS = {
     "EkfSlam": "8f62fa03",
     "Encoder": "9c7c1c0b",
     "External": "a594d99f",
-    "FastSLAM": "8a3a567e",
+    "FastSLAM": "02dccffb",
     "FixedLag": "c8a5ff52",
     "GraphSlam": "f4b95616",
     "GtsamBatch": "644cfc1c",

@@ -138,6 +138,16 @@ def test_errors_of_both_answers_are_within_their_covariances():
         assert 1.0 < squares < 4.5, kind
 
 
+@pytest.mark.parametrize(("start", "spread_rad"), [("apart", 0.0), ("drawn", 0.05)])
+def test_the_start_is_added_or_drawn(start, spread_rad):
+    recording = circle(seed=0, n_frames=2)
+    prior = tracking_prior(recording, (0.05, 0.05, 0.05))
+    estimator = FastSLAM(n_particles=2000, start=start)
+    online = run(estimator, recording, prior, np.random.default_rng(0), ("particles",))
+    assert online.extras["particles"][0][:, 2].std() == pytest.approx(spread_rad, rel=0.05)
+    assert np.sqrt(online.covariances[0, 2, 2]) == pytest.approx(0.05, rel=0.05)
+
+
 def test_shared_and_contiguous_maps_give_the_same_bits(recording):
     for options in (
         {"proposal": "motion", "resampling": "multinomial", "ess_share": 1.0},
