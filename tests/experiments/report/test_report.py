@@ -174,6 +174,10 @@ def test_the_page_of_all_results_is_small_and_loads_nothing(tmp_path):
     assert not re.search(r'(src|href)="https?://[^"]*\.(js|css|png|webp)"', page)
 
 
+def test_sentences_do_not_run_into_what_follows(text):
+    assert not re.findall(r"[a-z0-9)]\.<(?:i|a)[ >].{20}", text)
+
+
 def test_a_figure_without_a_caption_still_shows(text):
     page = Outline(text)
     figures = {e["id"]: e["text"] for e in page.all("figure")}
