@@ -47,7 +47,7 @@ class ParticlePath:
         self._lineages = Lineages(n_particles)
         self._filtered: list[Array] = []  # covariance of each draw under its weights then
         # of each Frame: its stamp, the draw it follows, and the motion since
-        self._frames: list[tuple[float, int, Array]] = []
+        self._frames: list[tuple[float, int, Gaussian]] = []
 
     def scatter(self, start: Gaussian, rng: np.random.Generator, draws_start: bool) -> None:
         """Draw the particles from the start, or put all at its mean: `place` adds its covariance.
@@ -122,7 +122,7 @@ class ParticlePath:
 
     def note(self, stamp: float) -> None:
         """Note a Frame."""
-        self._frames.append((stamp, len(self._lineages) - 1, self.rolled.mean))
+        self._frames.append((stamp, len(self._lineages) - 1, self.rolled))
 
     def resample(self, ancestors: Ints) -> None:
         """Give particle m the path of `ancestors[m]`, (M,)."""
@@ -144,10 +144,7 @@ class ParticlePath:
             by_row = np.bincount(rows, weights, minlength=len(poses)).astype(np.float64)
             spread = ekf.moments(poses, by_row)[1] + float(by_row @ by_row) * filtered
             drawn.append(Gaussian(poses[rows[best]], 2.0 * spread))
-        beliefs = [
-            self.place(drawn[n - 1 - draw].then(Gaussian(since, np.zeros((3, 3)))))
-            for _, draw, since in self._frames
-        ]
+        beliefs = [self.place(drawn[n - 1 - draw].then(since)) for _, draw, since in self._frames]
         stamps = np.array([stamp for stamp, _, _ in self._frames])
         return Estimate(stamps, *stack(beliefs), kind="revised", map=known_map)
 
