@@ -22,6 +22,13 @@ from tests.estimators.second_hand.landmark_drive import (
 )
 
 P0 = np.diag([0.02, 0.02, 0.01]) ** 2
+OPTIONS = {
+    "kr": KR,
+    "kl": KL,
+    "window_s": 0.0,
+    "noise_model": "diagonal",
+    "errors": "coordinates",
+}
 
 
 class Written:
@@ -84,7 +91,7 @@ def by_filterpy(mean, P, H, v, R):
 @pytest.mark.parametrize("seed", range(2))
 def test_each_step_is_the_written_one(update, seed):
     written = Written(update)
-    filtered = EkfSlam(kr=KR, kl=KL, window_s=0.0, noise_model="diagonal", keep_map=True)
+    filtered = EkfSlam(**OPTIONS, keep_map=True)
     filtered.reset(prior(P0), np.random.default_rng(0))
     for frame in drive(seed):
         belief = filtered.step(frame)
@@ -102,10 +109,12 @@ def test_each_step_is_the_written_one(update, seed):
             np.testing.assert_allclose(spread, written.P[rows, rows], rtol=1e-4, atol=1e-8)
 
 
-@pytest.mark.parametrize("other", [{"noise_at": "measured"}, {"kr": 2 * KR}])
+@pytest.mark.parametrize(
+    "other", [{"noise_at": "measured"}, {"kr": 2 * KR}, {"errors": "invariant"}]
+)
 def test_a_filter_that_differs_is_seen(other):
     written = Written(textbook)
-    options = {"kr": KR, "kl": KL, "window_s": 0.0, "noise_model": "diagonal", **other}
+    options = OPTIONS | other
     filtered = EkfSlam(**options)
     filtered.reset(prior(P0), np.random.default_rng(0))
     for frame in drive(0, 6):

@@ -89,6 +89,7 @@ def test_a_users_folder_of_logs(folder):
         assert kind == logs.POSES or case.recording.truth is None
 
 
+@pytest.mark.slow
 def test_every_method_believes_the_calibrated_noise(folder):
     case = own_logs.own_case(folder / "room.npz")
     methods(case)
