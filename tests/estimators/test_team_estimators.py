@@ -315,13 +315,16 @@ def test_a_robot_gains_nothing_from_itself():
     alone = run(EkfSlam(**WHEELS), own, priors[0], np.random.default_rng(0))
     np.testing.assert_allclose(found.covariances, alone.covariances, rtol=1e-9, atol=1e-15)
     np.testing.assert_allclose(found.means, alone.means, atol=1e-9)
-    twice = EkfSlam(**SEEING)  # that the same images counted twice would show
+    # that the same images counted twice would show, in the classical filter most
+    classical = EkfSlam(**WHEELS, errors="coordinates")
+    alone = run(classical, own, priors[0], np.random.default_rng(0))
+    twice = EkfSlam(**SEEING, errors="coordinates")
     twice.reset_team([priors[0]], np.random.default_rng(0))
     for frame in own.without("robots").frames():
         again = dataclasses.replace(frame, wheel_increments_m=np.zeros(2), duration_s=0.0)
         beliefs = [twice.step_team([each])[0] for each in (frame, again)]
     determinants = [np.linalg.det(c) for c in (beliefs[-1].covariance, alone.covariances[-1])]
-    assert determinants[0] < 0.995 * determinants[1]
+    assert determinants[0] < 0.95 * determinants[1]
 
 
 def test_kinds_of_communication():
