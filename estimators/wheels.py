@@ -17,7 +17,6 @@ from pydantic import Field
 
 from estimators.gaussian import STILL, Gaussian, compose, wheel_motion
 from sim.arrays import Array
-from sim.errors import require
 from sim.options import NonNegative, options
 from sim.recording import Frame
 from sim.robot.arc import TravelWindow
@@ -65,12 +64,6 @@ class GainOptions:
     them: a random walk over the way; 0: they are known."""
     gain_wander_m: NonNegative = 0.0
     """Variance of these states per metre of the way, 1/m."""
-
-    def __post_init__(self) -> None:
-        require(
-            not self.gain_wander_m or self.gain_sigma,
-            "estimator.gain_wander_m has no effect on known gains; set estimator.gain_sigma",
-        )
 
 
 class WheelPrediction:

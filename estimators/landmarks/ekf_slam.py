@@ -57,6 +57,13 @@ class EkfSlamOptions(LandmarkSlamOptions, GainOptions):
     the heading of the whole map look known, which linearising at ever other estimates does (Barrau
     and Bonnabel, "An EKF-SLAM algorithm with consistency properties", 2015)."""
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require(
+            not self.gain_wander_m or self.gain_sigma,
+            "estimator.gain_wander_m has no effect on known gains; set estimator.gain_sigma",
+        )
+
 
 class EkfSlam(EkfSlamOptions, TeamEstimator):
     """Extended Kalman filter over pose and landmarks.

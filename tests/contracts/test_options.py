@@ -34,6 +34,14 @@ def test_every_option_of_an_estimator_is_documented_and_rejects_what_it_does_not
             cls(**{option.name: object()})
 
 
+@pytest.mark.parametrize("cls", ESTIMATORS + SENSORS)
+def test_no_check_of_several_options_hides_another(cls):
+    """`__post_init__` of a class calls that of the next one, which Python does not do by itself."""
+    checks = [vars(base)["__post_init__"] for base in cls.__mro__ if "__post_init__" in vars(base)]
+    for check in checks[:-1]:
+        assert "__post_init__" in check.__code__.co_names, check.__qualname__
+
+
 def test_a_prior_without_what_an_estimator_needs_names_the_estimator():
     bare = Prior(RobotGeometry(0.05, 0.2), {})
     with pytest.raises(InputError, match=r"^mcl needs a start pose; "):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from estimators.landmarks.ekf_slam import EkfSlam
-from estimators.wheels import NO_MOTION, GainOptions, WheelOptions, WheelPrediction, gained_motion
+from estimators.wheels import NO_MOTION, WheelOptions, WheelPrediction, gained_motion
 from experiments.evaluation.metrics import nees, position_errors_m, rms
 from experiments.gate.conform import check_estimator
 from experiments.runs.experiment import Experiment
@@ -105,6 +105,6 @@ def test_states_of_no_deviation_are_none_and_small_ones_change_little():
 
 def test_what_has_no_effect_is_refused():
     with pytest.raises(InputError, match="gain_wander_m has no effect"):
-        GainOptions(gain_wander_m=1e-4)
+        EkfSlam(gain_wander_m=1e-4)
     with pytest.raises(InputError, match=r"below 0\.5, got 0\.7"):
-        GainOptions(gain_sigma=0.7)
+        EkfSlam(gain_sigma=0.7)
