@@ -19,10 +19,12 @@ with residuals e, r and A, B the derivatives of `between` at x_0*, x_1*. It is a
 EKF-SLAM, W images late, and costs as much, O(K N^2). W = 1 is an iterated EKF-SLAM; a W beyond
 the run, full least squares.
 
-Marginalised terms keep their point of linearisation. Those of one landmark differ by what W images
-teach, so the heading gains next to no false information (huang2009). First-estimate Jacobians of
-the landmarks left the errors of ten runs as they were at W = 20. A Bayes tree (kaess2012, iSAM2)
-linearises old poses again too, where they have moved.
+Marginalised terms keep their derivatives, but for one: an error of the heading of x_0 turns all of
+the map about its origin, so the prior's coordinates are taken about wherever the window's estimates
+are now (`_linearise_again`). Without that, terms that were linearised at different headings
+disagree on what a turn of the whole map does, its heading seems known (huang2009), and errors grow
+by a sixth over drives of 40 m. A Bayes tree (kaess2012, iSAM2) linearises old poses again instead,
+where they have moved.
 
 With a laser, the scans of consecutive images are registered, and their relative pose is one more
 measurement of u_i, of the covariance that `estimators.laser.scan_matching` gives it.
@@ -51,7 +53,7 @@ from estimators.graph.landmark_drive import (
 )
 from estimators.graph.least_squares import MIN_INFORMATION, OnStep
 from estimators.graph.matrices import inverse, times, transpose, whitening_of
-from estimators.landmarks.joint import JointGaussian
+from estimators.landmarks.joint import JointGaussian, quarter_turned
 from estimators.landmarks.stereo import StereoModel, StereoOptions
 from estimators.laser.icp import PreparedScan
 from estimators.laser.scan_matching import MatcherOptions, ScanMatcher
@@ -192,10 +194,12 @@ class FixedLag(FixedLagOptions):
             return False
         if not np.isfinite(step).all():
             return False
-        n = len(active)
+        n, old = len(active), active[active < self._n_prior]
+        before = np.vstack([self._poses[:1], self._landmarks[old]])
         self._landmarks[active] += step[:n]
         self._poses += step[n:]
         self._poses[:, 2] = se2.wrap(self._poses[:, 2])
+        self._linearise_again(old, before, np.vstack([self._poses[:1], self._landmarks[old]]))
         self._belief = Gaussian(self._poses[-1], root.T @ root)
         return True
 
@@ -247,6 +251,34 @@ class FixedLag(FixedLagOptions):
         # the newest pose is eliminated last, so its corner of the factor is its information's root
         return active, step, inverse(np.tril(factor[-3:, -3:]))
 
+    def _linearise_again(self, landmarks: Ints, before: Array, now: Array) -> None:
+        """Take the prior's coordinates about what the window now estimates.
+
+        An error of the heading turns all positions about the map's origin, however far the window
+        has turned them since; if it did not, the heading of the map would seem known.
+
+        Parameters
+        ----------
+        landmarks
+            (K,) those of the prior that the window sees.
+        before, now
+            (1 + K, 3) its estimates of the prior's pose and of them.
+        """
+        mean, P = self._prior.mean.reshape(-1, 3), self._prior.covariance
+        rows, at, to = np.append(0, 1 + landmarks), before[:, :2], now[:, :2]
+        turn, off_rad = wrap(now[0, 2] - before[0, 2]), wrap(mean[0, 2] - before[0, 2])
+        turned = se2.transform([0.0, 0.0, turn], at)
+        moved = se2.log(np.column_stack([to - turned, np.full(len(to), turn)]))[:, :2]
+        off = mean[rows, :2] - at - off_rad * quarter_turned(at) - moved
+        mean[rows, :2] = to + off + (off_rad - turn) * quarter_turned(to)
+        arms = quarter_turned(to - at).ravel()
+        xy = (3 * rows[:, None] + np.arange(2)).ravel()
+        change = np.outer(arms, P[2])
+        within = change[:, xy] + 0.5 * P[2, 2] * np.outer(arms, arms)
+        change[:, xy] = within + within.T
+        P[xy] += change
+        P[:, xy] = P[xy].T
+
     def _absorb(self, image: _Image) -> bool:
         """Make the oldest image of the window part of the prior, which moves on to its pose.
 
@@ -271,7 +303,10 @@ class FixedLag(FixedLagOptions):
         for other in self._images:
             idle[other.landmarks[other.landmarks < self._n_prior]] = False
         if self.keep_landmarks:  # out of the window they go with the prior, by their correlations
-            self._landmarks[: self._n_prior][idle] = self._prior.mean[3:].reshape(-1, 3)[idle]
+            left, means = np.flatnonzero(idle), self._prior.mean[3:].reshape(-1, 3)
+            before = np.vstack([self._poses[:1], self._landmarks[left]])
+            self._linearise_again(left, before, np.vstack([self._poses[:1], means[left]]))
+            self._landmarks[left] = means[left]
         else:
             self._forget(idle)
         return taken

@@ -16,7 +16,7 @@ from pydantic import Field
 from estimators.base import Belief, Prior, TeamEstimator
 from estimators.gaussian import STILL, Gaussian, compose, wrap
 from estimators.landmarks.doubt import Doubt
-from estimators.landmarks.joint import JointGaussian, mahalanobis_squared
+from estimators.landmarks.joint import JointGaussian, mahalanobis_squared, quarter_turned
 from estimators.landmarks.sightings import (
     Sightings,
     dead_reckoning,
@@ -358,12 +358,12 @@ class EkfSlam(EkfSlamOptions, TeamEstimator):
             is_place[n_robots : self._first_landmark // 3] = False  # gains
             of = np.concatenate([np.arange(n_robots), self._placed_by])
             before, turn = mean.reshape(-1, 3)[is_place, :2], by[headings[of]][:, None]
-            shift = by.reshape(-1, 3)[is_place, :2] - turn * _quarter_turned(before)
+            shift = by.reshape(-1, 3)[is_place, :2] - turn * quarter_turned(before)
             moved = _turned(before, turn) + _carried(shift, turn) - before
             by = by.copy()
             by.reshape(-1, 3)[is_place, :2] = moved
             arms = np.zeros((len(is_place), 3, n_robots))
-            arms[np.flatnonzero(is_place), :2, of] = _quarter_turned(moved)
+            arms[np.flatnonzero(is_place), :2, of] = quarter_turned(moved)
             D = arms.reshape(-1, n_robots)
             change = D @ (P[headings] + 0.5 * P[np.ix_(headings, headings)] @ D.T)
             P += change + change.T
@@ -455,14 +455,9 @@ def _own(robot: int) -> slice:
     return slice(3 * robot, 3 * robot + 3)
 
 
-def _quarter_turned(points: Array) -> Array:
-    """Points (..., 2) turned by a quarter about the map's origin: d(R(a) x) / da at 0."""
-    return np.stack([-points[..., 1], points[..., 0]], axis=-1)
-
-
 def _turned(points: Array, turn_rad: Array) -> Array:
     """R(a) x of points (n, 2) and turns (n, 1)."""
-    turned: Array = np.cos(turn_rad) * points + np.sin(turn_rad) * _quarter_turned(points)
+    turned: Array = np.cos(turn_rad) * points + np.sin(turn_rad) * quarter_turned(points)
     return turned
 
 

@@ -93,6 +93,11 @@ class JointGaussian:
         self.mean = self.mean[kept]
 
 
+def quarter_turned(points: Array) -> Array:
+    """Points (..., 2) turned by a quarter about the map's origin: d(R(a) x) / da at 0."""
+    return np.stack([-points[..., 1], points[..., 0]], axis=-1)
+
+
 def mahalanobis_squared(v: Array, S: Array) -> Array:
     """Squared distances (...) of innovations v (..., 3) by their covariances S (..., 3, 3)."""
     return np.asarray(np.sum(v * np.linalg.solve(S, v[..., None])[..., 0], axis=-1))

@@ -144,6 +144,37 @@ def test_it_is_close_to_full_least_squares():
     assert ratio < 1.05
 
 
+@pytest.mark.parametrize("lag_images", [1, 6])
+def test_seeing_landmarks_again_does_not_tell_where_north_is(lag_images, monkeypatch):
+    """Nothing may lower the uncertainty of the whole map's heading, given at the start."""
+
+    def min_sigma_rad():
+        sigmas, spread = [], 0.3
+        for seed in range(3):
+            recording = circle(seed, n_frames=120, kr=1e-3, kl=1e-3)
+            prior = tracking_prior(recording, sigma=(0.02, 0.02, spread))
+            turned = dataclasses.replace(prior, mean=prior.mean + np.array([0, 0, spread]))
+            online = follow(FixedLag(kr=1e-3, kl=1e-3, lag_images=lag_images), recording, turned)
+            sigmas.append(np.sqrt(online.covariances[:, 2, 2].min()) / spread)
+        return min(sigmas)
+
+    assert min_sigma_rad() > 0.995
+    monkeypatch.setattr(FixedLag, "_linearise_again", lambda *_: None)  # planted
+    assert min_sigma_rad() < 0.97
+
+
+def test_where_the_map_begins_changes_nothing():
+    """The same drive from another start, ten metres off and turned, with a heading in doubt."""
+    recording = circle(0, n_frames=60, kr=1e-4, kl=1e-4)
+    here = dataclasses.replace(tracking_prior(recording, (0.05, 0.05, 0.1)), mean=np.zeros(3))
+    begin, R = np.array([3.0, 10.0, 0.7]), np.eye(3)
+    R[:2, :2] = [[np.cos(0.7), -np.sin(0.7)], [np.sin(0.7), np.cos(0.7)]]
+    there = dataclasses.replace(here, mean=begin)
+    first, second = (follow(FixedLag(**WHEELS, lag_images=5), recording, p) for p in (here, there))
+    np.testing.assert_allclose(second.means, se2.compose(begin, first.means), atol=1e-6)
+    np.testing.assert_allclose(second.covariances, R @ first.covariances @ R.T, atol=1e-6)
+
+
 def test_the_revised_path_is_the_smoothers():
     recording = circle(2, n_frames=60, kr=1e-4, kl=1e-4)
     mine, batch = FixedLag(**WHEELS, lag_images=5), Smoother(**WHEELS)
