@@ -8,14 +8,17 @@ one, that hold neither a loss nor the `DELAY_S` before or after one: a method th
 grow warns before it is lost.
 """
 
+import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from numbers import Real
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from estimators.base import Estimate
 from experiments.evaluation.metrics import position_errors_m
 from sim.arrays import Array
+from sim.errors import require
 
 LOST_M, HOLD_S = 1.0, 2.0
 DELAY_S = 10.0
@@ -38,19 +41,42 @@ class Evidence(NamedTuple):
 
 
 def alarm_signal(estimate: Estimate) -> Array:
-    """How lost a method says it is (T,): in its own unit, or m; infinite without a pose."""
+    """How lost a method says it is (T,): in its own unit, or m; infinite without a pose.
+
+    Raises
+    ------
+    InputError
+        If it says so by something that is not a finite number.
+    """
     block, own = estimate.covariances[:, :2, :2], estimate.extras.get("lost", [])
     known = np.isfinite(estimate.means).all(axis=1) & np.isfinite(block).all(axis=(1, 2))
     signal = np.full(len(block), np.inf)
     if any(value is not None for value in own):
-        signal[known] = np.array([value or 0.0 for value in own], np.float64)[known]
+        signal[known] = _stated(estimate.stamps, own)[known]
     else:
         signal[known] = np.sqrt(np.maximum(np.linalg.eigvalsh(block[known])[:, -1], 0.0))
     return signal
 
 
+def _stated(stamps: Array, own: Sequence[Any]) -> Array:
+    """The extra `lost` (T,); where there is none, the last one, and 0 before the first."""
+    stated, last = np.zeros(len(stamps)), 0.0
+    for row, value in enumerate(own):
+        if value is not None:
+            require(
+                isinstance(value, Real) and math.isfinite(value),
+                f"extra lost at {stamps[row]:g} s must be a finite number or None, got {value!r}",
+            )
+            last = float(value)
+        stated[row] = last
+    return stated
+
+
 def find_losses(stamps: Array, errors_m: Array) -> Array:
-    """First and last stamp (L, 2), s, of each time of being lost; NaN errors are none."""
+    """First and last stamp (L, 2), s, of each time of being lost.
+
+    NaN errors are none: without a pose, a method says that it is lost.
+    """
     beyond = np.concatenate([[False], errors_m > LOST_M, [False]])
     begin, end = np.flatnonzero(np.diff(beyond.astype(np.int8))).reshape(-1, 2).T
     spans = np.column_stack([stamps[begin], stamps[end - 1]])

@@ -12,6 +12,7 @@ from experiments.evaluation.alarm import (
     evidence_of,
     find_losses,
 )
+from sim.errors import InputError
 
 STAMPS = np.arange(0.0, 60.0, 0.5)
 
@@ -38,6 +39,21 @@ def test_what_a_method_says():
     assert np.isinf(said[3])  # it has no pose
     own = [None, *np.linspace(0.0, 1.0, len(STAMPS) - 1)]
     assert alarm_signal(estimate(0.0 * STAMPS, sigma, own))[-1] == 1.0
+
+
+def test_silence_repeats_what_was_said_last():
+    sigma = np.full(len(STAMPS), 0.3)
+    own = [None, 0.9, None, 0.1, *[None] * (len(STAMPS) - 4)]
+    said = alarm_signal(estimate(0.0 * STAMPS, sigma, own))
+    assert said[:5].tolist() == [0.0, 0.9, 0.9, 0.1, 0.1]
+
+
+@pytest.mark.parametrize("wrong", [np.nan, np.inf, "yes", [0.1, 0.2]])
+def test_what_is_no_number_is_refused(wrong):
+    """NaN would neither miss a loss nor raise a false alarm."""
+    own = [0.0] * (len(STAMPS) - 1) + [wrong]
+    with pytest.raises(InputError, match=r"^extra lost at 59\.5 s must be a finite number"):
+        alarm_signal(estimate(0.0 * STAMPS, np.full(len(STAMPS), 0.3), own))
 
 
 def test_a_late_alarm_is_a_miss_and_what_is_near_a_loss_is_not_quiet():
