@@ -52,14 +52,20 @@ def alarm_signal(estimate: Estimate) -> Array:
     known = np.isfinite(estimate.means).all(axis=1) & np.isfinite(block).all(axis=(1, 2))
     signal = np.full(len(block), np.inf)
     if any(value is not None for value in own):
-        signal[known] = _stated(estimate.stamps, own)[known]
+        signal[known] = stated_lost(estimate.stamps, own)[known]
     else:
         signal[known] = np.sqrt(np.maximum(np.linalg.eigvalsh(block[known])[:, -1], 0.0))
     return signal
 
 
-def _stated(stamps: Array, own: Sequence[Any]) -> Array:
-    """The extra `lost` (T,); where there is none, the last one, and 0 before the first."""
+def stated_lost(stamps: Array, own: Sequence[Any]) -> Array:
+    """The extra `lost` (T,); where there is none, the last one, and 0 before the first.
+
+    Raises
+    ------
+    InputError
+        If one is not a finite number, which would neither miss a loss nor raise a false alarm.
+    """
     stated, last = np.zeros(len(stamps)), 0.0
     for row, value in enumerate(own):
         if value is not None:

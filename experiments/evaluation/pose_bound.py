@@ -13,6 +13,7 @@ about them, so that the pose's own covariance is P + U S^-1 U^T. This is the Sch
 the joint information of path and landmarks, and never inverts the covariance of a motion.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -119,19 +120,19 @@ def bound_dead_reckoning(
         (T, 3, 3), diagonal; x and y share the error of the position.
     """
     heading = start[2, 2] + np.zeros(len(steps))
-    square, mean, to_robot = start[0, 0] + start[1, 1], 0j, 0j  # E|p|^2, E p, E p exp(-i heading)
-    turned = complex(np.exp(-heading[0] / 2.0))  # E exp(i heading)
-    position = np.full(len(steps), square)
+    # E|p - E p|^2, and E (p - E p) exp(-i heading): as differences of moments, they would cancel
+    spread, to_robot = start[0, 0] + start[1, 1], 0j
+    position = np.full(len(steps), spread)
     for k in range(1, len(steps)):
         (x, y, turn), W = steps[k], wheel_covariances[k]
         by_way, by_turn = by_wheels[k, 0] + 1j * by_wheels[k, 1], by_wheels[k, 2]
-        spread = by_turn @ W @ by_turn
-        way, turning = complex(x, y), np.exp(-1j * turn - spread / 2.0)
-        square += 2.0 * (to_robot * way.conjugate()).real + abs(way) ** 2
-        square += (by_way @ W @ by_way.conj()).real
-        to_robot = (to_robot + way - 1j * (by_way @ W @ by_turn)) * turning
-        mean, turned = mean + turned * way, turned * turning.conjugate()
-        position[k], heading[k] = square - abs(mean) ** 2, heading[k - 1] + spread
+        way, turned = complex(x, y), by_turn @ W @ by_turn
+        fanned = -math.expm1(-heading[k - 1])  # 1 - |E exp(i heading)|^2
+        spread += 2.0 * (to_robot * way.conjugate()).real + fanned * abs(way) ** 2
+        spread += (by_way @ W @ by_way.conj()).real
+        to_robot = to_robot + fanned * way - 1j * (by_way @ W @ by_turn)
+        to_robot *= np.exp(-1j * turn - turned / 2.0)
+        position[k], heading[k] = spread, heading[k - 1] + turned
     n = np.arange(1, 40)[:, None]  # the Fourier series of the wrapped square
     wrapped = np.pi**2 / 3.0 + 4.0 * ((-1.0) ** n / n**2 * np.exp(-(n**2) * heading / 2.0)).sum(0)
     small = heading < 0.1

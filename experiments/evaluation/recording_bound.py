@@ -39,6 +39,8 @@ from sim.robot.drive import DifferentialDrive
 from sim.sensors import Encoder, Laser, Sensor, StereoCamera
 from sim.worlds.world import World
 
+_BENT_RAD2 = 0.3**2  # variance of a heading from which on sensors are not linearised
+
 
 @dataclass(frozen=True)
 class _Known:
@@ -55,7 +57,8 @@ def bound_recording(recording: Recording, prior: Prior, names: Iterable[str]) ->
     """Bound at each Frame of a recording; it is made once for several runs.
 
     None where there is no bound: over a recording that was not simulated, without a start, of a
-    robot or a sensor of another law, and with a laser but without a map.
+    robot or a sensor of another law, with a laser but without a map, where sensors do not say all
+    that is unknown, and where a heading is off by more than the linearised problem allows.
 
     Parameters
     ----------
@@ -68,7 +71,12 @@ def bound_recording(recording: Recording, prior: Prior, names: Iterable[str]) ->
     if blind or prior.covariance is None or not _is_known(recording, sensors):
         return None
     start, landmarks = prior.covariance.tobytes(), isinstance(prior.map, World)
-    return _bound(_Known(recording.checksum, read, start, landmarks, recording))
+    try:
+        bound = _bound(_Known(recording.checksum, read, start, landmarks, recording))
+    except np.linalg.LinAlgError:  # the information about a landmark is lost in rounding
+        return None
+    straight = not read or max(prior.covariance[2, 2], bound.online[:, 2, 2].max()) < _BENT_RAD2
+    return bound if straight and np.isfinite(bound.online).all() else None
 
 
 def bound_scores(covariances: Array) -> dict[str, float]:
@@ -90,7 +98,7 @@ def _is_known(recording: Recording, sensors: list[Sensor | None]) -> bool:
     if not isinstance(made_with, dict) or made_with.get("_target_", ours) != ours:
         return False
     return all(
-        (isinstance(sensor, Laser) and sensor.sigma_range_m > 0.0)
+        (type(sensor) is Laser and sensor.sigma_range_m > 0.0 and sensor.sweep_s == 0.0)
         or (
             isinstance(sensor, StereoCamera)
             and min(sensor.sigma_column_px, sensor.sigma_row_px, sensor.sigma_disparity_px) > 0.0

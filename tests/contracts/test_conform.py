@@ -94,6 +94,12 @@ class EastBound(Base):
         return Belief(belief.mean + np.array([0.01, 0, 0]), belief.covariance)
 
 
+class Unsure(Base):
+    def step(self, frame):
+        belief = super().step(frame)
+        return Belief(belief.mean, belief.covariance, {"lost": float("nan")})
+
+
 class Silent(Base):
     needs = frozenset({"laser"})
 
@@ -108,6 +114,7 @@ class Misspelt(Base):
         (NotFinite, {"finite"}),
         (Lopsided, {"covariance"}),
         (Negative, {"covariance"}),
+        (Unsure, {"lost"}),
         (OwnRandomness, {"same seed, same bits", "causal", "reset"}),
         (Meddler, {"frames untouched"}),
         (Forgetful, {"reset"}),

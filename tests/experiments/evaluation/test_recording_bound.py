@@ -11,6 +11,7 @@ from experiments.evaluation.statistics import over_bound
 from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
 from sim.recording import Recording
+from sim.sensors.stereo import points_in_camera
 
 DRIVE = (
     "robot=robocom",
@@ -58,12 +59,88 @@ def test_landmarks_that_are_known_tell_more():
     assert known["bound_rmse_m"] < unknown["bound_rmse_m"]
 
 
+def written_plainly(recording, start, after_s):
+    """Bound of known landmarks, Frame by Frame: RMS position and heading, by finite differences."""
+    robot, camera = recording.config["robot"], recording.sensors["stereo"]
+    gain = 1.0 + np.array([robot["bias_right"], robot["bias_left"]])
+    rates = np.array([robot["kr"], robot["kl"]]) / gain**2
+    truth = recording.truth_at(recording.frame_stamps)
+    rolled = recording.wheels.at(recording.frame_stamps) / gain
+    log, ids = recording.logs["stereo"], recording.truth.readings["stereo"]["true_ids"]
+    images = dict(zip(log.stamps.tolist(), np.split(ids, log.splits[1:-1]), strict=True))
+    R = np.diag([camera.sigma_column_px, camera.sigma_row_px, camera.sigma_disparity_px]) ** 2
+
+    def in_image(pose, landmark):
+        x, y, z = points_in_camera(camera, pose, landmark[None])[0]
+        return camera.focal_px / z * np.array([x, y, camera.baseline_m])
+
+    P, squares = start, []
+    for k, stamp in enumerate(recording.frame_stamps.tolist()):
+        if k:
+            wheels = rolled[k] - rolled[k - 1]
+            moved = truth[k][:2] - truth[k - 1][:2]
+            F, G = np.eye(3), slope(lambda w: rolled_on(truth[k - 1], w, robot["track_m"]), wheels)  # noqa: B023
+            F[:2, 2] = -moved[1], moved[0]
+            P = F @ P @ F.T + G @ np.diag(rates * np.abs(wheels)) @ G.T
+        for i in images.get(stamp, []):
+            H = slope(lambda pose: in_image(pose, recording.truth.world.landmarks[i]), truth[k])  # noqa: B023
+            P = P - P @ H.T @ np.linalg.solve(H @ P @ H.T + R, H @ P)
+        if stamp - recording.frame_stamps[0] >= after_s:
+            squares.append(np.diag(P))
+    x, y, heading = np.mean(squares, axis=0)
+    return np.sqrt(x + y), np.sqrt(heading)
+
+
+def rolled_on(pose, wheels_m, track_m):
+    right, left = wheels_m
+    turn, way = (right - left) / track_m, (right + left) / 2.0
+    chord = way if abs(turn) < 1e-9 else 2.0 * way / turn * np.sin(turn / 2.0)
+    along = pose[2] + turn / 2.0
+    return np.array(
+        [pose[0] + chord * np.cos(along), pose[1] + chord * np.sin(along), pose[2] + turn]
+    )
+
+
+def slope(function, at, step=1e-6):
+    columns = [(function(at + d) - function(at - d)) / (2.0 * step) for d in step * np.eye(len(at))]
+    return np.column_stack(columns)
+
+
+def test_is_the_bound_written_plainly():
+    words = (
+        *STEREO,
+        "robot.bias_right=0.03",
+        "robot.kr=1e-3",
+        "sensors.encoder.rate_hz=20",
+        "prior.map=world",
+        "scoring.after_s=2",
+        "estimator=ekf_slam",
+    )
+    experiment = Experiment.compose([*words])
+    recording = experiment.recording()
+    plain = written_plainly(recording, experiment.prior(recording).covariance, 2.0)
+    found = bound_columns(*words)
+    assert (found["bound_rmse_m"], found["bound_heading_rad"]) == pytest.approx(plain, rel=2e-3)
+
+
+def test_wheels_that_do_not_slip_and_a_start_that_is_known_leave_nothing():
+    exact = (*SHORT, "robot.kr=0", "robot.kl=0", "prior.sigma_position_m=0")
+    found = bound_columns(*exact, "prior.sigma_heading_rad=0", "estimator=odometry")
+    assert found == dict.fromkeys(COLUMNS, 0.0)
+
+
 @pytest.mark.parametrize(
     "words",
     [
         (*LASER, "estimator=ekf_icp"),  # no map
         (*LASER, "estimator=mcl", "prior.map=world", "prior.start=global"),
         (*LASER, "estimator=mcl", "prior.map=world", "sensors.laser.sigma_range_m=0"),
+        # of another law: it sweeps, and its range is biased
+        (*SHORT, "sensors=rplidar_a1", "estimator=mcl", "prior.map=world"),
+        # the information about far landmarks is lost in rounding
+        (*STEREO, "estimator=ekf_slam", "sensors.stereo.baseline_m=1e-4"),
+        # a heading in such doubt bends what is taken as straight
+        (*STEREO, "estimator=ekf_slam", "prior.sigma_heading_rad=0.4"),
     ],
 )
 def test_no_bound_without_what_it_takes(words):

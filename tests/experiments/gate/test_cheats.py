@@ -247,5 +247,6 @@ def test_errors_below_the_bound_are_called(monkeypatch, sigma, called):
     monkeypatch.setattr(KnowsTruth, "drives", drives)
     monkeypatch.setattr(KnowsTruth, "sigma", sigma)
     found = conform.find_below_bound(lambda: KnowsTruth(kr=1e-5, kl=1e-5), drives)
-    assert ("times the least of any honest method" in found) is called
-    assert not conform.find_below_bound(lambda: Odometry(kr=1e-5, kl=1e-5), drives)
+    assert ("times the least of any honest method" in found.message) is called
+    assert found.passed is not called
+    assert conform.find_below_bound(lambda: Odometry(kr=1e-5, kl=1e-5), drives).message == "ok"

@@ -3,6 +3,7 @@
 import numpy as np
 import pandas as pd
 
+from experiments.runs.evaluate import run_over
 from experiments.runs.experiment import Experiment
 from experiments.studies.self_knowledge import figures, study
 from experiments.studies.self_knowledge.planted import lift_wheels
@@ -30,6 +31,29 @@ def test_a_misread_start_is_a_loss_that_odometry_misses(monkeypatch):
     assert curve["missed"].iloc[-1] == 1.0  # without alarms
     line = figures.draw_alarms(curve).axes[0].get_lines()[0]
     assert line.get_label() == f"odometry ({len(losses)} losses)"
+
+
+def test_each_method_has_the_drive_and_the_start_that_are_said(monkeypatch):
+    driven, given = circle(seed=1, n_frames=240, kr=5e-5, kl=5e-5), []
+
+    def runs(recording, estimator, prior, rng, keep):
+        given.append((recording, prior.mean))
+        return run_over(recording, estimator, prior, rng, keep)
+
+    monkeypatch.setattr(Experiment, "recording", lambda self: driven)
+    monkeypatch.setattr(study, "run_over", runs)
+    one = Experiment.compose(["study=self_knowledge", "estimator=odometry"])
+    made = study.said([one])
+    (plain, at), (misread, beside), (lifted, same) = given
+    assert plain is misread is driven
+    np.testing.assert_allclose(beside - at, study.OFF)
+    np.testing.assert_array_equal(same, at)
+    assert (
+        np.ptp(lifted.wheels.position_m, axis=0).max()
+        < np.ptp(driven.wheels.position_m, axis=0).max()
+    )
+    (known,) = made["consistency"]
+    assert known["planted"] == "nothing"
 
 
 def test_runs_that_fail_are_counted_apart(monkeypatch):
