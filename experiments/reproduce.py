@@ -31,7 +31,7 @@ from experiments.judging.jobs import in_parallel
 from experiments.judging.logs import DATA, why_missing
 from experiments.judging.results import Profile, Results, reproduce_command
 from experiments.judging.sentences import Conclusion, conclude
-from experiments.report.page import write_report
+from experiments.report.contents import write_report
 from experiments.runs.console import pluralize, progress, show, warn
 from experiments.runs.dependencies.recorder import digest_of_all, recorded
 from experiments.runs.evaluate import limit_blas

@@ -1,4 +1,7 @@
-"""What the report shows, read from results/ into plain data."""
+"""The report, results/report.html: claims, figures, tables, and how to redo them.
+
+It is made only from what the studies left in results/.
+"""
 
 from __future__ import annotations
 
@@ -20,12 +23,14 @@ from experiments.judging.free_settings import FreeSettings, as_words, free_setti
 from experiments.judging.results import Profile, reproduce_command
 from experiments.report.export import as_text, fold_intervals, numeric_columns, plain
 from experiments.report.leaderboard import by_world, on_lasers
+from experiments.report.page import render
+from experiments.runs.console import warn
 from experiments.runs.paths import CONF
 from experiments.runs.row import read_rows
 from experiments.sweeps.summary import COUNT_WORDS
 from experiments.viewing.panels import read_panels
 from sim.errors import InputError, require
-from sim.files import require_file
+from sim.files import require_file, write_text
 
 Entry = Mapping[str, Any]
 _LAST = b"IEND\xaeB`\x82"  # bytes of a whole PNG
@@ -60,6 +65,28 @@ FIRST = (
 SMALL_ROWS, SMALL_COLUMNS = 60, 20  # a table up to here is shown whole
 FIRST_ROWS = 5  # of a larger one
 _REMEDY = "restore it by `git checkout`, or delete it and run `estima reproduce --full`"
+
+
+def write_report(results: Path, on_progress: Callable[[float], None] = lambda _: None) -> Path:
+    """Write `report.html` into the folder of results and return its path.
+
+    Parameters
+    ----------
+    results
+        Folder of claims.csv, provenance.json, figures/ and tables/; the page names what is missing.
+    on_progress
+        Called with the share done.
+    """
+    found = contents(results, on_progress)
+    if found["missing"]:
+        warn(
+            f"{results / 'claims.csv'}: no verdict on {', '.join(found['missing'])}, though others "
+            "of the paper have one; `git checkout results/claims.csv` or "
+            f"`{reproduce_command(None)}`"
+        )
+    path = results / "report.html"
+    write_text(path, render("page.html", **found))
+    return path
 
 
 def contents(results: Path, on_progress: Callable[[float], None]) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from pathlib import Path
 import pandas as pd
 
 from experiments.judging.results import reproduce_command
-from experiments.report.page import write_report
+from experiments.report.contents import write_report
 from experiments.report.plot import Size, sweep_figure
 from experiments.report.sweep_page import extremes, picture_path, write_sweep_page
 from experiments.report.table import as_lines, notes, statuses, write_table

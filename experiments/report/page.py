@@ -1,49 +1,21 @@
-"""One page of all results, results/report.html: claims, figures, tables, and how to redo them.
-
-It is made only from what the studies left in results/, and is a single file.
-"""
+"""Pages from templates: texts are escaped, and each is a single file."""
 
 import base64
 import hashlib
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 
-from experiments.judging.results import Profile, reproduce_command
-from experiments.report.contents import contents
+from experiments.judging.results import Profile
 from experiments.report.export import plain, significant
-from experiments.runs.console import warn
 from sim.errors import printable
-from sim.files import write_text
 
 TEMPLATES = Path(__file__).parent / "templates"
-
-
-def write_report(results: Path, on_progress: Callable[[float], None] = lambda _: None) -> Path:
-    """Write `report.html` into the folder of results and return its path.
-
-    Parameters
-    ----------
-    results
-        Folder of claims.csv, provenance.json, figures/ and tables/; the page names what is missing.
-    on_progress
-        Called with the share done.
-    """
-    found = contents(results, on_progress)
-    if found["missing"]:
-        warn(
-            f"{results / 'claims.csv'}: no verdict on {', '.join(found['missing'])}, though others "
-            "of the paper have one; `git checkout results/claims.csv` or "
-            f"`{reproduce_command(None)}`"
-        )
-    path = results / "report.html"
-    write_text(path, render("page.html", **found))
-    return path
 
 
 def render(template: str, **found: Any) -> str:

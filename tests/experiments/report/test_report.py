@@ -24,7 +24,7 @@ from experiments.judging.folders import findings
 from experiments.judging.results import Profile
 from experiments.judging.sentences import Conclusion
 from experiments.report import contents, leaderboard
-from experiments.report import page as report
+from experiments.report.page import code
 from experiments.runs.paths import SOURCE
 from experiments.runs.row import write_frame
 from experiments.viewing.style import save_figure, subplots
@@ -84,7 +84,7 @@ def results(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def text(results):
-    return report.write_report(results).read_text()
+    return contents.write_report(results).read_text()
 
 
 class Outline(HTMLParser):
@@ -169,7 +169,7 @@ def test_the_page_of_all_results_is_small_and_loads_nothing(tmp_path):
         (tmp_path / kind).symlink_to(SOURCE / "results" / kind)
     for name in ("claims.csv", "verdicts.csv", "provenance.json"):
         (tmp_path / name).symlink_to(SOURCE / "results" / name)
-    page = report.write_report(tmp_path).read_text()
+    page = contents.write_report(tmp_path).read_text()
     assert len(page.encode()) < 5_000_000
     assert not re.search(r'(src|href)="https?://[^"]*\.(js|css|png|webp)"', page)
 
@@ -196,7 +196,7 @@ def test_a_picture_of_a_table_is_shown_as_the_table(results, tmp_path):
         if there:
             small = copied / "tables" / "puzzlebot2024_small.csv"
             shutil.copy(small, small.with_name(f"{about[name]['table']}.csv"))
-        text = report.write_report(copied).read_text()
+        text = contents.write_report(copied).read_text()
         figure = text[text.index(f'<figure id="{name}"') :].partition("</figure>")[0]
         assert ("<table" in figure) == there
         assert ("<img" in figure) != there
@@ -233,7 +233,7 @@ def test_constants_are_printed_as_they_are_written(results, tmp_path, monkeypatc
     (tmp_path / "puzzlebot2024" / "settings.py").write_text(source)
     monkeypatch.setattr(contents, "code_folder", lambda name: tmp_path / name)
     copied = shutil.copytree(results, tmp_path / "results")
-    page = Outline(report.write_report(copied).read_text())
+    page = Outline(contents.write_report(copied).read_text())
     sections = {e.get("aria-labelledby"): e["text"] for e in page.all("section")}
     assert f"puzzlebot2024/settings.py{source}" in sections["puzzlebot2024"]
 
@@ -249,7 +249,7 @@ def test_what_belongs_to_no_paper_comes_last_with_its_command(text):
 
 
 def test_claims_that_a_cut_table_lacks_are_named(results, capsys):
-    header = Outline(report.write_report(results).read_text()).all("header")[0]["text"]
+    header = Outline(contents.write_report(results).read_text()).all("header")[0]["text"]
     assert "No verdict on PB2, PB3." in header  # of papers without any nothing is expected
     (line,) = capsys.readouterr().err.splitlines()
     assert "claims.csv: no verdict on PB2, PB3" in line
@@ -266,12 +266,12 @@ def test_claims_that_a_cut_table_lacks_are_named(results, capsys):
 def test_an_origin_that_is_none_is_named(tmp_path, made, wrong):
     (tmp_path / "provenance.json").write_text(json.dumps(made))
     with pytest.raises(InputError, match=f"provenance.json: .*{wrong}") as refused:
-        report.write_report(tmp_path)
+        contents.write_report(tmp_path)
     assert "\n" not in str(refused.value)
 
 
 def test_an_empty_folder_gives_a_page_that_says_so(tmp_path):
-    text = report.write_report(tmp_path).read_text()
+    text = contents.write_report(tmp_path).read_text()
     assert "not judged yet" in text
     assert not Outline(text).all("img")
 
@@ -287,11 +287,11 @@ def test_a_damaged_figure_is_named(tmp_path, results):
     ):
         path.write_bytes(data)
         with pytest.raises(InputError, match=rf"gil2008_8\.png: {why}"):
-            report.write_report(tmp_path)
+            contents.write_report(tmp_path)
     path.unlink()
     path.mkdir()
     with pytest.raises(InputError, match=r"gil2008_8\.png: not a file; name a file, or remove it"):
-        report.write_report(tmp_path)
+        contents.write_report(tmp_path)
 
 
 @pytest.mark.parametrize("paper", [*contents.PAPERS, *contents.OWN, "real_logs"])
@@ -364,7 +364,7 @@ def test_panels_stand_below_each_other_on_a_phone(tmp_path):
     save_figure(page, tmp_path / "figures" / "leaderboard_errors.png")
     places = "e => e.getBoundingClientRect().toJSON()"
     with browser.page() as tab:
-        tab.open(report.write_report(tmp_path).as_uri())
+        tab.open(contents.write_report(tmp_path).as_uri())
         for width in (1400, 390):
             tab.shape(width, 800)
             shown = tab.js(
@@ -445,7 +445,7 @@ def test_the_marks_of_a_table_of_means_are_explained(tmp_path):
 
 
 def test_backticks_become_code_and_nothing_else_does():
-    assert report.code("of `a_b` <i>") == "of <code>a_b</code> &lt;i&gt;"
+    assert code("of `a_b` <i>") == "of <code>a_b</code> &lt;i&gt;"
 
 
 def test_what_scrolls_sideways_can_be_reached_by_keyboard(tab):
