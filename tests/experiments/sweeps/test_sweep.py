@@ -340,9 +340,10 @@ def test_launchers_give_the_same_table(name, launcher):
 def test_a_killed_sweep_comes_to_the_same_table(launcher, tmp_path):
     if launcher == "ray":
         pytest.importorskip("hydra_plugins.hydra_ray_launcher", reason="an extra, not installed")
-    (killed, undisturbed), counts, _ = kill_sweeps.run(tmp_path, launcher, n_kills=20, seed=0)
+    # 20 kills, as docs/clusters.md has them, take ten minutes: python -m tests.fixtures.kill_sweeps
+    (killed, undisturbed), counts, _ = kill_sweeps.run(tmp_path, launcher, n_kills=6, seed=0)
     assert killed == undisturbed
-    assert sum(counts.values()) == 20
+    assert sum(counts.values()) == 6
     assert min(counts.values()) > 0
 
 
