@@ -57,8 +57,8 @@ def bound_recording(recording: Recording, prior: Prior, names: Iterable[str]) ->
     """Bound at each Frame of a recording; it is made once for several runs.
 
     None where there is no bound: over a recording that was not simulated, without a start, of a
-    robot or a sensor of another law, with a laser but without a map, where sensors do not say all
-    that is unknown, and where a heading is off by more than the linearised problem allows.
+    robot or a sensor of another law, with a laser but without a map, where rounding loses what
+    is known of a landmark, and where a heading is off by more than the linearised problem allows.
 
     Parameters
     ----------
@@ -71,12 +71,11 @@ def bound_recording(recording: Recording, prior: Prior, names: Iterable[str]) ->
     if blind or prior.covariance is None or not _is_known(recording, sensors):
         return None
     start, landmarks = prior.covariance.tobytes(), isinstance(prior.map, World)
-    try:
-        bound = _bound(_Known(recording.checksum, read, start, landmarks, recording))
-    except np.linalg.LinAlgError:  # the information about a landmark is lost in rounding
+    bound = _bound(_Known(recording.checksum, read, start, landmarks, recording))
+    if bound is None or not np.isfinite(bound.online).all():
         return None
     straight = not read or max(prior.covariance[2, 2], bound.online[:, 2, 2].max()) < _BENT_RAD2
-    return bound if straight and np.isfinite(bound.online).all() else None
+    return bound if straight else None
 
 
 def bound_scores(covariances: Array) -> dict[str, float]:
@@ -108,8 +107,8 @@ def _is_known(recording: Recording, sensors: list[Sensor | None]) -> bool:
 
 
 @functools.lru_cache(maxsize=4)
-def _bound(known: _Known) -> PathBound:
-    """The bound over all Frames of a recording."""
+def _bound(known: _Known) -> PathBound | None:
+    """The bound over all Frames of a recording; None where rounding has spoilt it."""
     recording, start = known.recording, np.frombuffer(known.start).reshape(3, 3)
     travel_m, wheels = _travel_and_slip(recording)
     if not known.sensors:
@@ -137,7 +136,10 @@ def _bound(known: _Known) -> PathBound:
             if not known.landmarks:
                 sights = Sights(frames, _by_first_sight(seen), cross, own)
                 chain = chain._replace(sights=sights)
-    return bound_path(chain)
+    try:
+        return bound_path(chain)
+    except np.linalg.LinAlgError:
+        return None
 
 
 def _travel_and_slip(recording: Recording) -> tuple[Array, WheelNoise]:
