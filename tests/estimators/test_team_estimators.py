@@ -168,7 +168,8 @@ def test_the_team_is_as_sure_as_it_errs(known):
     assert np.isfinite(found).all()
     low, high = stats.chi2.ppf([0.0005, 0.9995], 3 * 12) / 12  # robots of a map err together
     assert low < found.mean() < high
-    bold = final_nees(lambda: EkfSlam(robots="robots", kr=3e-7, kl=3e-7), range(4), 0, known=known)
+    believed = {"kr": 1e-6, "kl": 1e-6, "errors": "coordinates"}
+    bold = final_nees(lambda: EkfSlam(robots="robots", **believed), range(4), 0, known=known)
     assert bold.mean() > high  # a filter that believes too little slip is found out
 
 

@@ -14,7 +14,8 @@ from sim import se2
 from sim.errors import InputError
 from sim.recording import Frame
 from sim.robot.drive import RobotGeometry
-from tests.estimators.landmarks.test_ekf_slam import follow, slope
+from tests.estimators.landmarks.test_ekf_slam import follow
+from tests.fixtures.derivatives import slope
 from tests.fixtures.fakes import tracking_prior
 
 GAINS = np.array([0.04, -0.03, 0.05])

@@ -148,7 +148,7 @@ def test_it_is_close_to_full_least_squares():
 def test_seeing_landmarks_again_does_not_tell_where_north_is(lag_images, monkeypatch):
     """Nothing may lower the uncertainty of the whole map's heading, given at the start."""
 
-    def min_sigma_rad():
+    def min_share_of_spread():
         sigmas, spread = [], 0.3
         for seed in range(3):
             recording = circle(seed, n_frames=120, kr=1e-3, kl=1e-3)
@@ -158,9 +158,9 @@ def test_seeing_landmarks_again_does_not_tell_where_north_is(lag_images, monkeyp
             sigmas.append(np.sqrt(online.covariances[:, 2, 2].min()) / spread)
         return min(sigmas)
 
-    assert min_sigma_rad() > 0.995
+    assert min_share_of_spread() > 0.995
     monkeypatch.setattr(FixedLag, "_linearise_again", lambda *_: None)  # planted
-    assert min_sigma_rad() < 0.97
+    assert min_share_of_spread() < 0.97
 
 
 def test_where_the_map_begins_changes_nothing():

@@ -16,6 +16,7 @@ from sim.errors import InputError
 from sim.robot.arc import TravelWindow, arc_increment
 from sim.sensors import Mount
 from sim.sensors.stereo import points_in_camera
+from tests.fixtures.derivatives import slope
 from tests.fixtures.fakes import circle, tracking_prior, true_ids, with_descriptors, with_field
 
 K_M = 1e-4  # kr and kl
@@ -30,12 +31,6 @@ def follow(estimator, recording, prior=None, seed=0, keep=("associations", "stat
 def joined(estimate):
     images = [a for a in estimate.extras["associations"] if a is not None]
     return np.concatenate(images)
-
-
-def slope(function, x, step=1e-6):
-    """Derivative by central differences."""
-    ways = step * np.eye(len(x))
-    return np.array([(function(x + w) - function(x - w)) / (2 * step) for w in ways]).T
 
 
 def of_the_map(mean):

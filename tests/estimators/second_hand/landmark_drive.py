@@ -26,11 +26,6 @@ def arc(ds):
     return np.array([way / turn * math.sin(turn), way / turn * (1.0 - math.cos(turn)), turn])
 
 
-def slope(function, x, step=1e-6):
-    ways = step * np.eye(len(x))
-    return np.array([(function(x + w) - function(x - w)) / (2 * step) for w in ways]).T
-
-
 def predicted(s, landmark):
     """g of eq. (3): the landmark in the camera, X right, Y down, Z ahead."""
     c, n = math.cos(s[2]), math.sin(s[2])

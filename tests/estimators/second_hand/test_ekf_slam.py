@@ -18,8 +18,8 @@ from tests.estimators.second_hand.landmark_drive import (
     placed,
     predicted,
     prior,
-    slope,
 )
+from tests.fixtures.derivatives import slope
 
 P0 = np.diag([0.02, 0.02, 0.01]) ** 2
 OPTIONS = {

@@ -20,8 +20,8 @@ from tests.estimators.second_hand.landmark_drive import (
     placed,
     predicted,
     prior,
-    slope,
 )
+from tests.fixtures.derivatives import slope
 
 M = 12
 PRINTED = {

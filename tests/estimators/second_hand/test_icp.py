@@ -10,6 +10,7 @@ import pytest
 
 from estimators.laser import icp_covariance, icp_iterations, icp_start
 from estimators.laser.icp import Rules, prepare, register
+from tests.fixtures.derivatives import slope
 
 BEARINGS_RAD = np.linspace(-np.pi / 2, np.pi / 2, 241)
 ARMS = ["point_to_point", "matched_point", "centroid"]  # the metrics, and planes of the second
@@ -59,11 +60,6 @@ def errors(pose, source, target, j, arm, normals, through):
     """Distances of the source's points from what they are matched with: E of sec. II-C is e @ e."""
     off = moved(pose, source) - (target[j] if arm == "point_to_point" else through[j])
     return off.ravel() if arm == "point_to_point" else np.sum(off * normals[j], axis=1)
-
-
-def slope(function, x, step=1e-6):
-    ways = step * np.eye(len(x))
-    return np.array([(function(x + w) - function(x - w)) / (2 * step) for w in ways]).T
 
 
 def printed_steps(source, target, pose, arm, n):

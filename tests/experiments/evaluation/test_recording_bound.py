@@ -12,6 +12,7 @@ from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
 from sim.recording import Recording
 from sim.sensors.stereo import points_in_camera
+from tests.fixtures.derivatives import slope
 
 DRIVE = (
     "robot=robocom",
@@ -99,11 +100,6 @@ def rolled_on(pose, wheels_m, track_m):
     return np.array(
         [pose[0] + chord * np.cos(along), pose[1] + chord * np.sin(along), pose[2] + turn]
     )
-
-
-def slope(function, at, step=1e-6):
-    columns = [(function(at + d) - function(at - d)) / (2.0 * step) for d in step * np.eye(len(at))]
-    return np.column_stack(columns)
 
 
 def test_is_the_bound_written_plainly():
