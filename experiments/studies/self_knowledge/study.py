@@ -38,6 +38,7 @@ _SCORES = (
     "inside_50_share",
     "inside_90_share",
     "inside_95_share",
+    "nees_counted_share",
     "sharpness_m",
 )
 
