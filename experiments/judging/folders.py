@@ -68,10 +68,10 @@ def _region_page(claim: str) -> dict[str, Any]:
     return {
         "title": f"Where {claim} holds",
         "alt": (
-            f"Left, where {claim} holds over the two settings that decide it most, with the "
-            "boundary and its interval, the sampled points and the anchor. Middle, the first "
-            "headline's ratio along the first of them, with the criterion. Right, the first-order "
-            "index of each free setting with its interval."
+            f"Left, where {claim} holds for sure, fails for sure, and neither, over the two "
+            "settings that decide it most, with the sampled points and the anchor. Middle, the "
+            "ratio that misses first along the first of them, with its 95 % interval. Right, the "
+            "share of the variance that each free setting explains alone."
         ),
         "paper": "The paper leaves these settings open; this figure adds them.",
         "claims": [claim],

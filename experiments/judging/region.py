@@ -36,6 +36,7 @@ NOWHERE, EVERYWHERE, NONE_ALONE = (
     "everywhere in the region",
     "no single setting",
 )
+_NO_EFFECT = 1e-3  # spread of a log ratio over the region that no setting need explain
 _LOCATED = 0.5  # of a setting's range, in which a boundary's interval must lie to be named
 _N_SHARE, _N_OTHERS, _N_LEVELS, _N_LINE = 1024, 64, 16, 201
 
@@ -55,11 +56,17 @@ class Side:
     high: float = math.inf
     effect: float = SMALLEST_EFFECT
 
-    def margin(self, logs: Array) -> Array:
-        """How far log ratios lie on the claim's side, by the smallest effect or more if > 0."""
+    @property
+    def needed(self) -> tuple[float, float]:
+        """The limits, the single one moved inward by the smallest effect."""
         is_band = math.isfinite(self.low) and math.isfinite(self.high)
         need = 0.0 if is_band else math.log1p(self.effect)
-        return np.asarray(np.minimum(logs - self.low, self.high - logs) - need)
+        return self.low + need, self.high - need
+
+    def margin(self, logs: Array) -> Array:
+        """How far log ratios lie on the claim's side, by the smallest effect or more if > 0."""
+        low, high = self.needed
+        return np.asarray(np.minimum(logs - low, high - logs))
 
 
 @dataclass(frozen=True)
@@ -256,7 +263,7 @@ def first_order(fitted: Fitted) -> Array:
         places[..., i] = ((np.arange(_N_LEVELS) + 0.5) / _N_LEVELS)[:, None]
         margins = fitted.margins(snap(fitted.settings, places.reshape(-1, d)))
         by_level = margins.reshape(len(margins), _N_LEVELS, _N_OTHERS)
-        total = np.maximum(by_level.var(axis=(1, 2)), 1e-300)
+        total = np.maximum(by_level.var(axis=(1, 2)), _NO_EFFECT**2)
         found.append(by_level.mean(axis=2).var(axis=1) / total)
     return np.stack(found, axis=1)
 

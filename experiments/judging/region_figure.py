@@ -1,26 +1,24 @@
 """Where a claim holds over the two settings that decide it most."""
 
+import textwrap
 from collections.abc import Sequence
 
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from experiments.evaluation.statistics import Interval
-from experiments.judging.free_settings import Anchor, Scale, Setting, snap, units_of
+from experiments.judging.free_settings import Anchor, Scale, Setting, as_words, snap, units_of
 from experiments.judging.region import Fitted, first_order
-from experiments.viewing.plotting import draw_interval, plain_log, with_legend
+from experiments.viewing.plotting import draw_interval, with_legend
 from experiments.viewing.style import BLACK, BLUE, ORANGE, WALL, literal, subplots
 from sim.arrays import Array
 
 _N_GRID = 81
-_TICKS = {  # by the ratio of an axis' ends
-    2.0: (1.0, 1.1, 1.2, 8.0, 9.0),
-    15.0: (1.0, 1.2, 1.5, 2.0, 3.0, 5.0, 7.0),
-    np.inf: (1.0, 2.0, 5.0),
-}
-_HOLDS, _FAILS = "#9BD0A5", "#F2B48C"
+_N_TICKS = 5
+_HOLDS, _UNCERTAIN, _FAILS = "#6BAED6", "#FFFFFF", "#FDD9A8"  # they differ in grey too
 
 
 def draw_region(
@@ -34,112 +32,161 @@ def draw_region(
 ) -> Figure:
     """Draw where a claim holds, its critical ratio along the setting that decides, what decides.
 
+    The settings that are not drawn are at the anchor; without one, in the middle of their ranges.
+
     Parameters
     ----------
     points
         The sampled settings.
+    title
+        The claim.
     quantities
-        The headlines' ratios, in words. Drawn is the one farthest from the claim's side, of those
-        that depend on the setting.
+        The headlines' ratios, in words. Drawn is the one that misses its limit first at most
+        places of the map, of those that depend on the setting.
     printed
         The paper's own ratios; None where it prints none.
     """
     indices = first_order(fitted)
     order = [int(i) for i in indices[0].argsort()[::-1]]
-    page, axes = subplots(10.0, 3.9, 1, 3, suptitle=literal(title))
-    place = None
+    of = order[0], order[min(1, len(order) - 1)]
+    height_in = max(4.3, 1.8 + 0.5 * len(order))
+    page, axes = subplots(10.0, height_in, 1, 3, suptitle=literal(textwrap.fill(title, 120)))
+    place = np.full(len(fitted.settings), 0.5)
     if anchor is not None:
         place = units_of(fitted.settings, pd.DataFrame([dict(anchor.settings)]))[0]
+    _draw_map(axes[0], fitted, place, of)
     sampled = units_of(fitted.settings, points)
-    _draw_map(axes[0], fitted, sampled, place, (order[0], order[min(1, len(order) - 1)]))
-    critical = _critical(fitted, place, order[0])
-    _draw_line(axes[1], fitted, critical, place, order[0], printed[critical])
+    axes[0].plot(*sampled[:, of].T, ".", color=WALL, ms=3, label="sampled")
+    if anchor is not None:
+        star = {"color": BLACK, "ms": 13, "mec": "white", "clip_on": False, "zorder": 3}
+        axes[0].plot(*place[list(of)], "*", label="anchor", **star)
+        axes[1].axvline(place[of[0]], color=BLACK, lw=0.8, ls=":")
+    critical = _critical(fitted, place, of)
+    _draw_line(axes[1], fitted, critical, place, of[0], printed[critical])
+    n, others = len(quantities), "the middle" if anchor is None else "the anchor"
+    axes[0].set_title(f"Where it holds\n(other settings at {others})", fontsize="medium")
+    what = f"The critical of its {n} ratios" if n > 1 else "Its ratio"
+    axes[1].set_title(f"{what}\n(other settings at {others})", fontsize="medium")
     axes[1].set_ylabel(literal(quantities[critical]))
     for row, i in enumerate(reversed(order)):
         low, high = np.quantile(indices[1:, i], [0.025, 0.975])
         draw_interval(axes[2], row, Interval(indices[0, i], low, high), along="x", color=BLUE)
-    names = [literal(fitted.settings[i].called) for i in reversed(order)]
+    names = [literal(textwrap.fill(fitted.settings[i].called, 32)) for i in reversed(order)]
     axes[2].set_yticks(range(len(order)), names)
-    axes[2].set(xlim=(-0.02, 1.02), xlabel="first-order index", title="What decides")
-    return with_legend(page, 6, of=axes[0])
+    axes[2].set(xlim=(-0.02, 1.02), xlabel="share of the margin's variance\n(first-order index)")
+    axes[2].set_title("What decides it", fontsize="medium")
+    return with_legend(page, 7, of=axes[:2])
 
 
-def _draw_map(
-    ax: Axes, fitted: Fitted, sampled: Array, place: Array | None, of: tuple[int, int]
-) -> None:
-    """Draw where the claim holds over two settings, the others at their middle."""
-    side = np.linspace(0.0, 1.0, _N_GRID)
-    across, up = np.meshgrid(side, side)
-    units = np.full((across.size, len(fitted.settings)), 0.5)
+def _over_two(
+    fitted: Fitted, place: Array, of: tuple[int, int]
+) -> tuple[Array, Array, Array]:
+    """A grid (G, G) over two settings, across and up, and all settings (G * G, D) there."""
+    across, up = np.meshgrid(*[np.linspace(0.0, 1.0, _N_GRID)] * 2)
+    units = np.tile(place, (across.size, 1))
     units[:, of[1]], units[:, of[0]] = up.ravel(), across.ravel()
-    margins = fitted.margins(snap(fitted.settings, units)).reshape(-1, *across.shape)
-    ax.contourf(across, up, margins[0] > 0.0, levels=[-0.5, 0.5, 1.5], colors=[_FAILS, _HOLDS])
+    return across, up, snap(fitted.settings, units)
+
+
+def _draw_map(ax: Axes, fitted: Fitted, place: Array, of: tuple[int, int]) -> None:
+    """Draw where the claim holds over two settings, where it does not, and where none is sure."""
+    across, up, units = _over_two(fitted, place, of)
+    margins = fitted.margins(units).reshape(-1, *across.shape)
     sure = (margins[1:] > 0.0).mean(axis=0)
-    for heights, level, style in ((margins[0], 0.0, "-"), (sure, 0.025, "--"), (sure, 0.975, "--")):
-        if heights.min() < level < heights.max():
-            width = 1.4 if style == "-" else 0.8
-            ax.contour(across, up, heights, levels=[level], colors=[BLACK], linewidths=width,
-                       linestyles=style)  # fmt: skip
-    ax.plot(sampled[:, of[0]], sampled[:, of[1]], ".", color=WALL, ms=3, label="sampled")
-    for colour, words in ((_HOLDS, "holds"), (_FAILS, "does not hold")):
-        ax.fill_between([], [], color=colour, label=words)
-    ax.plot([], [], color=BLACK, lw=1.4, label="boundary")
-    ax.plot([], [], "--", color=BLACK, lw=0.8, label="its 95 % interval")
-    if place is not None:
-        ax.plot(*place[list(of)], "*", color=BLUE, ms=13, mec="white", label="anchor")
-    _name_axis(ax, fitted.settings[of[0]], "x")
-    _name_axis(ax, fitted.settings[of[1]], "y")
-    ax.set(xlim=(0.0, 1.0), ylim=(0.0, 1.0), title="Where it holds")
+    fills = {"does not hold": _FAILS, "uncertain (95 %)": _UNCERTAIN, "holds": _HOLDS}
+    levels = [-1.0, 0.025, 0.975, 2.0]
+    ax.contourf(across, up, sure, levels=levels, colors=[*fills.values()])
+    shown = np.unique(np.digitize(sure, levels[1:-1]))
+    for i, (words, colour) in enumerate(fills.items()):
+        if i in shown:
+            ax.fill_between([], [], facecolor=colour, edgecolor=WALL, lw=0.5, label=words)
+    steps = any(fitted.settings[i].scale is Scale.CHOICE for i in of)
+    if not steps and margins[0].min() < 0.0 < margins[0].max():
+        ax.contour(across, up, margins[0], levels=[0.0], colors=[BLACK], linewidths=1.4)
+        ax.plot([], [], color=BLACK, lw=1.4, label="boundary, best estimate")
+    for i, axis in zip(of, "xy", strict=True):
+        _name_axis(ax, fitted.settings[i], axis)
     if of[0] == of[1]:
         ax.set(yticks=[], ylabel="")
 
 
-def _critical(fitted: Fitted, place: Array | None, i: int) -> int:
-    """The headline that is farthest from the claim's side, of those that depend on a setting."""
-    at = np.full((1, len(fitted.settings)), 0.5) if place is None else place[None]
+def _critical(fitted: Fitted, place: Array, of: tuple[int, int]) -> int:
+    """The headline that misses first at most places, of those that depend on the setting."""
     every = range(len(fitted.settings))
-    margins = {
-        k: float(side.margin(fitted.logs(k, at))[0, 0])
-        for k, side in enumerate(fitted.sides)
-        if i in every[fitted.columns[k]]
-    }
-    return min(margins, key=margins.__getitem__)
+    margins = fitted.margins_apart(_over_two(fitted, place, of)[2])[:, 0]
+    depends = [of[0] in every[columns] for columns in fitted.columns]
+    margins[~np.array(depends)] = np.inf
+    return int(np.bincount(margins.argmin(axis=0), minlength=len(margins)).argmax())
 
 
 def _draw_line(
-    ax: Axes, fitted: Fitted, headline: int, place: Array | None, i: int, printed: float | None
+    ax: Axes, fitted: Fitted, headline: int, place: Array, i: int, printed: float | None
 ) -> None:
-    """Draw a headline's ratio along a setting, the others at the anchor or their middle."""
-    u = np.linspace(0.0, 1.0, _N_GRID)
-    units = np.tile(np.full(len(fitted.settings), 0.5) if place is None else place, (_N_GRID, 1))
+    """Draw a headline's ratio along a setting, the others at a place."""
+    setting, side = fitted.settings[i], fitted.sides[headline]
+    is_choice = setting.scale is Scale.CHOICE
+    u = setting.units(setting.choices) if is_choice else np.linspace(0.0, 1.0, _N_GRID)
+    units = np.tile(place, (len(u), 1))
     units[:, i] = u
     logs = fitted.logs(headline, snap(fitted.settings, units))
-    low, high = np.exp(np.quantile(logs[1:], [0.025, 0.975], axis=0))
-    ax.fill_between(u, low, high, color=BLUE, alpha=0.25, lw=0)
-    ax.plot(u, np.exp(logs[0]), color=BLUE, label="found")
-    side = fitted.sides[headline]
-    limits = [v for v in (side.low, side.high) if np.isfinite(v)]
-    for limit in limits:
-        ax.axhline(np.exp(limit), color=BLACK, lw=0.8, ls="--", label="criterion")
+    ratio, (low, high) = np.exp(logs[0]), np.exp(np.quantile(logs[1:], [0.025, 0.975], axis=0))
+    if is_choice:
+        for at, *found in zip(u, ratio, low, high, strict=True):
+            draw_interval(ax, at, Interval(*found), color=BLACK)
+    else:
+        ax.fill_between(u, low, high, color=BLACK, alpha=0.25, lw=0)
+        ax.plot(u, ratio, color=BLACK)
     if printed is not None:
-        ax.axhline(printed, color=ORANGE, lw=1.4, label="the paper's")
-    if place is not None:
-        ax.axvline(place[i], color=BLUE, lw=0.8, ls=":", label="anchor")
-    _name_axis(ax, fitted.settings[i], "x")
-    ax.set(xlim=(0.0, 1.0), yscale="log", title="Its ratio")
+        ax.axhline(printed, color=ORANGE, lw=1.4, label="the paper's ratio")
+    passing = np.exp(side.needed)
+    for limit in passing[np.isfinite(passing) & (passing > 0.0)]:
+        ax.axhline(limit, color=BLACK, lw=0.8, ls="--")
+    _name_axis(ax, setting, "x")
+    ax.set(xlim=(0.0, 1.0), yscale="log")
     bottom, top = ax.get_ylim()
-    plain_log(ax.yaxis, next(each for most, each in _TICKS.items() if top < most * bottom))
-    named = dict(zip(*ax.get_legend_handles_labels()[::-1], strict=True))  # a label once
-    ax.legend(named.values(), named.keys(), fontsize=8, framealpha=0.9)
+    ax.axhspan(max(passing[0], bottom), min(passing[1], top), color=_HOLDS, alpha=0.4, lw=0,
+               zorder=0, label="ratios that pass")  # fmt: skip
+    ax.set_ylim(bottom, top)
+    values = _round_values(bottom, top, is_log=True)
+    ax.set_yticks(values, [_number(v) for v in values])
+    ax.minorticks_off()
 
 
 def _name_axis(ax: Axes, setting: Setting, axis: str) -> None:
-    """Label an axis in shares of a range by the setting's values."""
-    shares = np.linspace(0.0, 1.0, 5)
-    values = setting.at(shares)
-    if setting.scale in (Scale.INTEGER, Scale.CHOICE):
-        values = list(setting.choices) or list(dict.fromkeys(values))
-        shares = setting.units(values)
-    words = [f"{v:.2g}" if isinstance(v, float) else literal(str(v)) for v in values]
-    named = {f"{axis}ticks": shares, f"{axis}ticklabels": words}
-    ax.set(**{f"{axis}label": literal(setting.called)}, **named)
+    """Label an axis in shares of a range by round values of the setting."""
+    if setting.choices:
+        values = list(setting.choices)
+        breaks = "\n" if axis == "x" else " "
+        words = [literal(as_words(v).replace("_", breaks)) for v in values]
+    else:
+        values = _round_values(
+            setting.low, setting.high, setting.scale is Scale.LOG, setting.scale is Scale.INTEGER
+        )
+        words = [_number(v) for v in values]
+    named = {f"{axis}ticks": setting.units(values), f"{axis}ticklabels": words}
+    ax.set(**{f"{axis}label": literal(textwrap.fill(setting.called, 36))}, **named)
+    ax.set(**{f"{axis}lim": (0.0, 1.0)})
+
+
+def _round_values(
+    low: float, high: float, is_log: bool = False, is_integer: bool = False
+) -> list[float]:
+    """A few round values between two."""
+    if is_log and high > 5.0 * low:
+        decades = 10.0 ** np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high)) + 1.0)
+        tried = [np.outer(decades, multiples).ravel() for multiples in ((1.0, 2.0, 5.0), (1.0,))]
+        tried += [decades[::2], decades[::4]]
+    else:
+        tried = [MaxNLocator(_N_TICKS - 1, integer=is_integer).tick_values(low, high)]
+    beyond = 1e-9 * abs(high)
+    inside = [v[(v >= low - min(beyond, 1e-9 * abs(low))) & (v <= high + beyond)] for v in tried]
+    return list(next((v for v in inside if len(v) <= _N_TICKS), inside[-1]).tolist())
+
+
+def _number(value: float) -> str:
+    """A round number, a small or a large one by its power of ten."""
+    if value == 0.0 or 1e-3 <= abs(value) < 1e4:
+        return f"{value:g}"
+    mantissa, _, power = f"{value:e}".partition("e")
+    times = "" if float(mantissa) == 1.0 else rf"{float(mantissa):g}\cdot"
+    return rf"${times}10^{{{int(power)}}}$"

@@ -15,6 +15,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from experiments.judging.claim import Claim, waiting
+from experiments.judging.folders import findings
 from experiments.judging.free_settings import FreeSettings, free_settings, sample
 from experiments.judging.jobs import Tables
 from experiments.judging.region import Fitted, Region, Side, describe, fit
@@ -201,9 +202,10 @@ def judged_regions(results: Results, headlines: Headlines) -> dict[str, Region]:
 
 def region_pages(results: Results, headlines: Headlines) -> dict[str, Figure]:
     """A figure of each claim's region, as far as the runs are there."""
+    says = findings(results.paper)["claims"]
     return {
         f"{results.paper}_region_{claim}": draw_region(
-            fitted, points, free.drawn_anchor, title=f"Where {claim} holds",
+            fitted, points, free.drawn_anchor, title=f"{claim}: {says[claim]}",
             quantities=[each.words for each in headlines[claim]],
             printed=[each.printed for each in headlines[claim]],
         )

@@ -80,12 +80,17 @@ def with_legend(
     page: Figure,
     ncols: int,
     loc: str = "outside lower center",
-    of: Axes | None = None,
+    of: Axes | Sequence[Axes] | None = None,
     **style: Any,
 ) -> Figure:
     """Add one legend for all axes, of what the first of them (or `of`) shows; return the page."""
-    handles, labels = (of or page.axes[0]).get_legend_handles_labels()
-    page.legend(handles, labels, loc=loc, ncols=ncols, **style)  # type: ignore[call-overload]
+    shown = [page.axes[0]] if of is None else [of] if isinstance(of, Axes) else of
+    named = {
+        label: handle
+        for ax in shown
+        for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)
+    }
+    page.legend([*named.values()], [*named], loc=loc, ncols=ncols, **style)
     return page
 
 

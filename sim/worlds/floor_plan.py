@@ -248,7 +248,7 @@ class Plan:
         return np.vstack([legs, np.array(self.approaches, float).reshape(-1, 4)])
 
     def _fits(self, corners: Array, faces: Array, paths: Array, clearance_m: float) -> bool:
-        """Whether a convex object keeps off faces, paths and the other objects."""
+        """Whether a convex object stands on a floor, off faces, paths and the other objects."""
         edges = np.hstack([corners, np.roll(corners, -1, axis=0)])
         lowest, highest = corners.min(axis=0), corners.max(axis=0)
         paths = _near(paths, lowest - clearance_m, highest + clearance_m)
@@ -259,6 +259,8 @@ class Plan:
             return False
         # The outlines do not cross, but one may still lie inside the other.
         centre = corners.mean(axis=0)
+        if self.floors and not any(inside(centre[None], floor)[0] for floor in self.floors):
+            return False
         reach = float(np.max(np.hypot(*(corners - centre).T)))
         return not any(
             inside(centre[None], ring)[0] or inside(ring[:1], corners)[0]

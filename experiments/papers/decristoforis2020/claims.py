@@ -67,8 +67,8 @@ HEADLINES: Headlines = {
         Compared("sampling_time_us", "censi_last_time_us", "time, sampling / Censi", at_least=10.0),
     ],
     "DC5": [
-        Compared(f"plane_{key}", f"point_{key}", f"plane / point, {key}", at_most=1.0)
-        for key in ("error_m", "error_rad", "time_us")
+        Compared(f"plane_{key}", f"point_{key}", f"plane / point, {what}", at_most=1.0)
+        for what, key in _COSTS
     ],
 }
 
@@ -274,9 +274,7 @@ def dc5(metrics: pd.DataFrame, design: Design | None = None) -> Iterator[Claim]:
     for better, kind in itertools.product(("plane", "line"), (None, *kinds)):
         part = wide if kind is None else wide.xs(kind, level="class", drop_level=False)
         hits = []
-        for what, column in (
-            ("position error", "error_m"), ("heading error", "error_rad"), ("time", "time_us"),
-        ):  # fmt: skip
+        for what, column in _COSTS:
             logs = np.log(part[column].clip(lower=1e-9)).groupby("seed").mean()
             first, second = (np.exp(logs[f"point_to_{to}"]) for to in (better, "point"))
             label = f"{what}, point to {better} over point to point{', ' + kind if kind else ''}"

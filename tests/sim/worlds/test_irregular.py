@@ -13,7 +13,7 @@ from sim.sensors import Laser, Mount
 from sim.sensors.rays import ExactRays
 from sim.simulate import Member, record
 from sim.worlds.buildings import Rooms, boxes, office, room
-from sim.worlds.floor_plan import CHORD_ERROR_M, arc_points, gaps_m, round_corners
+from sim.worlds.floor_plan import CHORD_ERROR_M, arc_points, gaps_m, inside, round_corners
 from sim.worlds.irregular import Clutter, CorridorsAlike, Curved, Hall, Polygon
 from sim.worlds.posts import Orchard, Warehouse
 
@@ -49,6 +49,13 @@ def test_chords_are_off_the_circle_by_less_than_a_tenth_of_a_millimetre():
         assert np.allclose(
             arc[[0, -1]], radius * np.array([[np.cos(a), np.sin(a)] for a in (0.3, 0.9)])
         )
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_things_stand_within_the_walls(seed):
+    world = built(Polygon, seed)
+    outline = world.walls[: Polygon().n_sides, :2]
+    assert inside(world.walls[Polygon().n_sides :, :2], outline).all()
 
 
 def test_tables_are_legs_to_a_laser():
