@@ -383,7 +383,7 @@ def measured_text(
         f"drawn from the pool ({power['checks'].iloc[0]} each):",
         "",
         to_markdown(pd.DataFrame([_fault(row) for row in power.to_dict("records")])),
-        "![The worsening that 95 % of checks find, of each estimator and fault]"
+        "![The smallest rise that 95 % of checks find, of each estimator and fault; dashed: the goal]"
         "(figures/regression.png)",
         "",
         f"All faults together: {100 * overall.value:.1f} % found (95 %: {100 * overall.low:.1f} to "
@@ -426,7 +426,9 @@ def draw_detectable(power: pd.DataFrame, target: float) -> Figure:
     axes.axvline(100.0 * target, color=WALL, linestyle="--", linewidth=1.0)
     axes.set_yticks(range(len(names)), names)
     axes.invert_yaxis()
-    axes.set(xlim=(0.0, None), xlabel="worsening of the position error that 95 % of checks find, %")
+    axes.set(
+        xlim=(0.0, None), xlabel="smallest rise of the position error that 95 % of checks find, %"
+    )
     axes.legend(title="fault", loc="upper left", bbox_to_anchor=(1.0, 1.0))
     return page
 

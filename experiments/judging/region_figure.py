@@ -78,9 +78,7 @@ def draw_region(
     return with_legend(page, 7, of=axes[:2])
 
 
-def _over_two(
-    fitted: Fitted, place: Array, of: tuple[int, int]
-) -> tuple[Array, Array, Array]:
+def _over_two(fitted: Fitted, place: Array, of: tuple[int, int]) -> tuple[Array, Array, Array]:
     """A grid (G, G) over two settings, across and up, and all settings (G * G, D) there."""
     across, up = np.meshgrid(*[np.linspace(0.0, 1.0, _N_GRID)] * 2)
     units = np.tile(place, (across.size, 1))
@@ -154,16 +152,13 @@ def _draw_line(
 
 def _name_axis(ax: Axes, setting: Setting, axis: str) -> None:
     """Label an axis in shares of a range by round values of the setting."""
-    if setting.choices:
-        values = list(setting.choices)
-        breaks = "\n" if axis == "x" else " "
-        words = [literal(as_words(v).replace("_", breaks)) for v in values]
-    else:
-        values = _round_values(
-            setting.low, setting.high, setting.scale is Scale.LOG, setting.scale is Scale.INTEGER
-        )
-        words = [_number(v) for v in values]
-    named = {f"{axis}ticks": setting.units(values), f"{axis}ticklabels": words}
+    breaks, scale = "\n" if axis == "x" else " ", setting.scale
+    numbers = _round_values(setting.low, setting.high, scale is Scale.LOG, scale is Scale.INTEGER)
+    words = [literal(as_words(v).replace("_", breaks)) for v in setting.choices]
+    named = {
+        f"{axis}ticks": setting.units(setting.choices or numbers),
+        f"{axis}ticklabels": words or [_number(v) for v in numbers],
+    }
     ax.set(**{f"{axis}label": literal(textwrap.fill(setting.called, 36))}, **named)
     ax.set(**{f"{axis}lim": (0.0, 1.0)})
 
@@ -177,7 +172,8 @@ def _round_values(
         tried = [np.outer(decades, multiples).ravel() for multiples in ((1.0, 2.0, 5.0), (1.0,))]
         tried += [decades[::2], decades[::4]]
     else:
-        tried = [MaxNLocator(_N_TICKS - 1, integer=is_integer).tick_values(low, high)]
+        ticks = MaxNLocator(_N_TICKS - 1, integer=is_integer).tick_values(low, high)
+        tried = [np.asarray(ticks, float)]
     beyond = 1e-9 * abs(high)
     inside = [v[(v >= low - min(beyond, 1e-9 * abs(low))) & (v <= high + beyond)] for v in tried]
     return list(next((v for v in inside if len(v) <= _N_TICKS), inside[-1]).tolist())

@@ -90,7 +90,7 @@ def with_legend(
         for ax in shown
         for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)
     }
-    page.legend([*named.values()], [*named], loc=loc, ncols=ncols, **style)
+    page.legend([*named.values()], [*named], loc=loc, ncols=ncols, **style)  # type: ignore[call-overload]
     return page
 
 

@@ -26,6 +26,7 @@ from experiments.papers.decristoforis2020.settings import CONSISTENT, PLACES, PR
 from sim.arrays import Array
 
 _ERRORS = {"position": "ate_rmse_m", "heading": "heading_rmse_rad"}
+_COSTS = (("position error", "error_m"), ("heading error", "error_rad"), ("time", "time_us"))
 _OVER_10_M = "rpe_10m_heading_rmse_rad"
 _ORDER = (("fusion", "icp"), ("fusion", "odometry"))
 _BESIDE = (

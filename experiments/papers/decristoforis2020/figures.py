@@ -93,13 +93,15 @@ def route(office: Arrays) -> Figure:
     ax.plot(*office["truth"][0], "o", color=BLUE, ms=5, label="start")
     for name, color in (("A", RED), ("B", GREEN)):
         x1, y1, x2, y2 = office[f"area_{name}"]
-        ax.add_patch(Rectangle((x1, y1), x2 - x1, y2 - y1, color=color, alpha=0.3, lw=0))
+        what = {"A": "A: a curve", "B": "B: a corridor with objects"}[name]
+        box = Rectangle((x1, y1), x2 - x1, y2 - y1, color=color, alpha=0.3, lw=0, label=what)
+        ax.add_patch(box)
         ax.annotate(
             name, (x1 if x1 < 1.0 else x2, (y1 + y2) / 2), (-12.0 if x1 < 1.0 else 12.0, 0.0),
             textcoords="offset points", ha="center", va="center", color=color, size=13,
             weight="bold",
         )  # fmt: skip
-    return with_legend(page, ncols=2, loc="outside upper center")
+    return with_legend(page, ncols=4, loc="outside upper center")
 
 
 def ellipses(office: Arrays, areas: pd.DataFrame, path: pd.DataFrame) -> Figure:
@@ -113,12 +115,12 @@ def ellipses(office: Arrays, areas: pd.DataFrame, path: pd.DataFrame) -> Figure:
     for ax, name, what in zip(
         top.subplots(1, 2, width_ratios=(1.0, 3.2)),
         "AB",
-        ("a curve", "a corridor with objects, lying down"),
+        ("a curve", "a corridor with objects, rotated by 90°"),
         strict=True,
     ):
         rows = areas[areas["area"] == name]
         _enlarged_ellipses(ax, office, rows, scale, f"{name}: {what}", lying=name == "B")
-    top.suptitle(f"95 % ellipses of a registration, {scale:.0f} times enlarged", size=9)
+    top.suptitle(f"95 % ellipses of a registration, enlarged {scale:.0f} times", size=9)
     ax = bottom.subplots()
     for name, color in (("long", BLUE), ("short", ORANGE)):
         sigma_mm = 1e3 * path[f"{name}_m"]
@@ -138,6 +140,7 @@ def ellipses(office: Arrays, areas: pd.DataFrame, path: pd.DataFrame) -> Figure:
         ends = inside.min(), inside.max()
         ax.axvspan(*ends, color=color, alpha=0.12, lw=0)
         ax.text(sum(ends) / 2, 2.2 * high, name, ha="center", va="top", size=8)
+    ax.set_title("axes of a step's ellipse along a judged drive", fontsize="medium", loc="left")
     ax.set(xlabel="distance, m", ylabel="standard deviation\nof a step, mm", ylim=(low, 2.5 * high))
     ax.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2)
     return page
@@ -200,7 +203,9 @@ def boxes(table: pd.DataFrame) -> Figure:
     page, axes = subplots(8.0, 3.8, 1, 2)
     _boxes(axes, table)
     page.suptitle(
-        "all recordings; box: quartiles; whiskers: within 1.5 times the interquartile range", size=9
+        "all recordings; box: quartiles; whiskers: within 1.5 times the interquartile range; "
+        "what lies beyond is not drawn",
+        size=9,
     )
     return page
 
@@ -226,7 +231,7 @@ def real_log(log: Arrays, table: pd.DataFrame) -> Figure:
     page = figure(10.0, 8.0)
     top, bottom = page.subfigures(2, 1, height_ratios=(1.3, 1.0))  # type: ignore[misc]
     left, *boxed = top.subplots(1, 3, width_ratios=(1.6, 1.0, 1.0))
-    left.plot(*log["truth"].T, color=COLORS["truth"], lw=1.0, label="a mapper's poses")
+    left.plot(*log["truth"].T, color=COLORS["truth"], lw=1.0, label="reference: a mapper's poses")
     for method in PAPERS_OWN:
         left.plot(*log[method].T, color=COLORS[method], lw=0.8, label=NAMES[method])
     plan_axes(left)
@@ -275,7 +280,7 @@ def runs(table: pd.DataFrame) -> Figure:
         ax.set_xticks(range(len(methods)), [NAMES[m] for m in methods], rotation=35, ha="right")
     axes[-1].axhspan(*CONSISTENT, color=GREEN, alpha=0.2, lw=0)
     page.suptitle(
-        "dot: a recording; line: median; diamond: RMSE by the method's own covariance; "
+        "dot: a recording; line: median; diamond: RMSE predicted by the method's own covariance; "
         "green: consistent",
         size=9,
     )
@@ -312,7 +317,7 @@ def covariances(table: pd.DataFrame) -> Figure:
     for ax in axes[:2]:
         ax.set(xlim=(0.4, max(8.0, *ax.get_xlim())))
         low, high = ax.get_xlim()
-        plain_ticks(ax, (2.0**i for i in range(-1, 10) if low <= 2.0**i <= high))
+        plain_ticks(ax, (4.0**i for i in range(-1, 6) if low <= 4.0**i <= high))
     return with_legend(page, ncols=5, loc="outside upper center")
 
 
@@ -389,8 +394,8 @@ def steps(table: pd.DataFrame) -> Figure:
         xticklabels=["position", "heading"],
     )
     page.supxlabel(
-        "dot: median of the recordings; bar: least to greatest\n"
-        "line: uncorrelated, consistent, at the bound",
+        "dot: median of the recordings; bar: minimum to maximum\n"
+        "line: no correlation; a consistent covariance; an error at the Fisher bound",
         size=9,
     )
     return with_legend(page, ncols=2, loc="outside upper center")

@@ -56,7 +56,7 @@ _CHI_95_3D = 2.7955
 _PATH, _MAP = "revised_ate_rmse_m", "map_rmse_m"
 _INTERVALS = "geometric means over worlds, 95 % intervals"
 _LEFT: dict[str, Any] = {"title_style": {"loc": "left"}}
-_BOTH = ((_PATH, "RMS of the path, m"), (_MAP, "RMS of the map, m"))
+_BOTH = ((_PATH, "RMS error of the path, m"), (_MAP, "RMS error of the map, m"))
 
 
 def draw(results: Results) -> dict[str, Figure]:
@@ -143,20 +143,18 @@ def association_ellipses() -> Figure:
 
 def world_3d(run: Arrays) -> Figure:
     """Figure 5: the world in three dimensions, with ellipsoids of the landmarks of one image."""
-    page = figure(13.0, 4.8)
-    for i, name in enumerate(_SHOWN):
-        ax: Any = page.add_subplot(1, 2, i + 1, projection="3d")
-        _draw_3d(ax, run, name)
-        ax.set_title(_FILTERS[name][2], loc="left")
+    page = figure(9.0, 5.6)
+    name = _SHOWN[-1]
+    colour, _, words = _FILTERS[name]
+    ax: Any = page.add_subplot(projection="3d")
+    _draw_3d(ax, run, name)
     styles: dict[str, dict[str, Any]] = {
         "estimated path": {"color": BLACK},
         "walls": {"color": WALL},
-        "sight of a landmark in the image": {"color": SKY},
+        "robot": {"color": BLACK, "marker": "o", "ls": ""},
+        "line of sight to a landmark in the image": {"color": SKY},
         "95 % ellipsoid of such a landmark": {"color": GREEN},
-        **{
-            f"landmarks, {words}": {"color": colour, "marker": ".", "ls": ""}
-            for colour, _, words in map(_FILTERS.__getitem__, _SHOWN)
-        },
+        f"landmarks mapped, {words}": {"color": colour, "marker": ".", "ls": ""},
     }
     handles = [Line2D([], [], label=label, **style) for label, style in styles.items()]
     page.legend(handles=handles, loc="outside lower center", ncols=3)
@@ -180,7 +178,8 @@ def _draw_3d(ax: Any, run: Arrays, name: str) -> None:
     for mean, covariance in seen:
         ax.plot(*_ellipsoid(mean, covariance), color=GREEN, lw=0.3)
         ax.plot(*np.array([eye, mean]).T, color=SKY, lw=0.5)
-    ax.plot(*landmarks[near(landmarks)].T, ".", color=_FILTERS[name][0], ms=2)
+    ax.plot(*landmarks[near(landmarks)].T, ".", color=_FILTERS[name][0], ms=4)
+    ax.plot(*eye, "o", color=BLACK, ms=6)
     ax.set(
         xlim=pose[0] + np.array([-reach, reach]),
         ylim=pose[1] + np.array([-reach, reach]),
@@ -190,7 +189,7 @@ def _draw_3d(ax: Any, run: Arrays, name: str) -> None:
         zlabel="z, m",
         zticks=range(4),
     )
-    ax.set_box_aspect((2.0 * reach, 2.0 * reach, 3.0), zoom=1.0)
+    ax.set_box_aspect((2.0 * reach, 2.0 * reach, 3.0), zoom=1.25)
     ax.zaxis.labelpad = 0.0
 
 
@@ -235,6 +234,10 @@ def components(run: Arrays) -> Figure:
         left.set(ylabel=component)
         right.set(ylabel=f"error of {component}", ylim=ylim)
     set_axes(axes[-1], xlabel="path travelled, m")
+    axes[0, 0].set_title("the pose", fontsize="medium")
+    axes[0, 1].set_title(
+        "its errors (batch: least squares over the whole drive)", fontsize="medium"
+    )
     handles = [handle for ax in axes[0] for handle in ax.get_legend_handles_labels()[0]]
     page.legend(handles=handles, loc="outside upper center", ncols=3)
     return page
@@ -305,7 +308,8 @@ def by_particles_over_worlds(particles: pd.DataFrame, bound: pd.DataFrame) -> Fi
 
 def by_distance(distance: pd.DataFrame) -> Figure:
     """Figure 9: dmax, by filter, choice of observations, walls and noise."""
-    page, axes = subplots(11.5, 4.4, 1, 2, sharex=True, suptitle=_INTERVALS)
+    about = f"{_INTERVALS}; dotted: the paper's dmax, 10 m"
+    page, axes = subplots(11.5, 4.4, 1, 2, sharex=True, suptitle=about)
     kinds = {
         ("paper", True, "paper", 0, "random"): (RED, "-", "as printed, all visible"),
         ("paper", False, "paper", 0, "random"): (RED, "--", "as printed, no walls"),
@@ -338,7 +342,7 @@ def by_observations(observations: pd.DataFrame) -> Figure:
     for ax, (column, label) in zip(axes, _BOTH, strict=True):
         _by_filter(ax, observations, "n_seen", column)
         scale = {"xscale": "log", "plain": "y", "ticks": observations["n_seen"]}
-        set_axes(ax, xlabel="most observations of an image (B)", ylabel=label, **scale)
+        set_axes(ax, xlabel="maximum observations per image (B)", ylabel=label, **scale)
     return with_legend(page, ncols=2)
 
 
@@ -361,7 +365,7 @@ def by_association(association: pd.DataFrame) -> Figure:
     ]
     counts = [len(ways) for _, _, ways in compared]
     size = (10.0, 0.36 * sum(counts) + 1.2, len(counts), 2)
-    page, grid = subplots(*size, squeeze=False, sharey="row", height_ratios=counts)
+    page, grid = subplots(*size, squeeze=False, sharex="col", sharey="row", height_ratios=counts)
     for (noise, table, ways), (left, right) in zip(compared, grid, strict=True):
         labels = []
         for i, ((name, sigma, p0), part) in enumerate(ways):
@@ -393,7 +397,10 @@ def by_association(association: pd.DataFrame) -> Figure:
 def by_settings(resampling: pd.DataFrame, noise: pd.DataFrame) -> Figure:
     """Resampling schemes, and where R is taken, by noise."""
     page, (left, right) = subplots(10.0, 3.8, 1, 2, suptitle=_INTERVALS)
-    schemes = ((1.0, "at every image", ORANGE, "o"), (0.5, "when ESS < M / 2", BLUE, "s"))
+    schemes = (
+        (1.0, "at every image", ORANGE, "o"),
+        (0.5, "when the effective sample size < M / 2", BLUE, "s"),
+    )
     for j, (share, words, colour, marker) in enumerate(schemes):
         part = resampling[resampling["ess_share"] == share]
         middle, bars = _intervals(part, "resampling", "revised_ate_aligned_rmse_m")
@@ -403,7 +410,8 @@ def by_settings(resampling: pd.DataFrame, noise: pd.DataFrame) -> Figure:
         left,
         xticks=range(len(middle)),
         xticklabels=middle.index,
-        ylabel="RMS of the path, aligned, m",
+        xlabel="resampling scheme",
+        ylabel="RMS error of the aligned path, m",
         ylim=(0.0, None),
         title="FastSLAM 1.0, M = 200",
         legend={},
@@ -419,7 +427,7 @@ def by_settings(resampling: pd.DataFrame, noise: pd.DataFrame) -> Figure:
         plain="y",
         ticks=noise["sigma_px"],
         xlabel="noise of column and row, px",
-        ylabel="RMS of the path, m",
+        ylabel="RMS error of the path, m",
         title="FastSLAM 2.0, M = 200",
         legend={},
         **_LEFT,
@@ -433,9 +441,9 @@ def cost(table: pd.DataFrame) -> Figure:
     for maps_kind, part in table.groupby("maps", sort=False):
         colour, words = (BLUE, "shared") if maps_kind == "shared" else (ORANGE, "copied")
         wide = part.groupby("n_landmarks")["step_ms"]
-        label = f"{words} maps: median, least to greatest"
-        style = {"marker": "o", "color": colour, "label": label}
-        draw_band(ax, wide.median(), (wide.min(), wide.max()), 0.2, **style)
+        style = {"marker": "o", "ms": 4, "color": colour}
+        ax.plot(wide.median(), "-", label=f"{words} maps: median", **style)
+        ax.plot(wide.quantile(0.95), "--", label=f"{words} maps: 95 % of the steps", **style)
     set_axes(
         ax,
         xscale="log",
@@ -443,11 +451,10 @@ def cost(table: pd.DataFrame) -> Figure:
         ticks=table["n_landmarks"],
         xlabel="landmarks N",
         ylabel="time of a step, ms",
-        title="M = 1000, B = 20, resampling at every image",
-        legend={},
+        title="1000 particles, 20 observations per image,\nresampling at every image",
         **_LEFT,
     )
-    return page
+    return with_legend(page, ncols=2)
 
 
 def _grid(run: Arrays, name: str) -> OccupancyGrid:

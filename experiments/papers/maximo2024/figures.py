@@ -29,7 +29,6 @@ from experiments.viewing.style import (
     GREEN,
     ORANGE,
     RED,
-    SKY,
     WALL,
     plan_axes,
     subplots,
@@ -38,7 +37,7 @@ from experiments.viewing.style import (
 _COLOUR = {"M1": ORANGE, "M2": BLUE, "M3": GREEN}
 _FLOOR_M = {"oxford": 1.0, "umh": 0.03, "campus": 0.1}
 _DESCRIPTORS = {"scan_context": "Scan Context", "ring_key": "ring key", "m2dp": "M2DP"}
-_RECALL = {"recall_at_1": "recall@1", "recall_at_1_percent": "recall@1 %"}
+_RECALL = {"recall_at_1": "recall@1"}  # at 1 % it is the same: that is one node
 
 
 def draw(results: Results) -> dict[str, Figure]:
@@ -68,18 +67,22 @@ def draw(results: Results) -> dict[str, Figure]:
 
 def data(campus: Arrays) -> Figure:
     """Figure 1: clouds at the nodes of the map and along the robot's way, seen from above."""
-    page, ax = subplots(6.0, 5.4)
-    here, there = campus["map_spots_m"], campus["query_spots_m"]
-    ax.plot(*campus["map_clouds_m"].T, ".", color=BLUE, ms=2.6, mew=0)
-    ax.plot(*campus["query_clouds_m"].T, ".", color=RED, ms=0.9, mew=0)
-    ax.plot(*here.T, "x", color=BLUE, ms=9, mew=2, label="nodes of the map and their clouds")
-    ax.plot(*there.T, "x", color=RED, ms=9, mew=2, label="observations on the way")
+    page, axes = subplots(9.5, 4.8, 1, 2, sharex=True, sharey=True)
+    both = {
+        "nodes of the map and their clouds": ("map", BLUE),
+        "observations in the adjacent lane": ("query", RED),
+    }
+    for ax, (words, (name, colour)) in zip(axes, both.items(), strict=True):
+        ax.plot(*campus[f"{name}_clouds_m"].T, ".", color=colour, ms=1.8, mew=0)
+        ax.plot(*campus[f"{name}_spots_m"].T, "x", color=BLACK, ms=9, mew=2)
+        ax.set_title(f"{words} (x)", fontsize="medium")
     # what lies within 40 m of the nodes
-    shown = np.concatenate([line.get_xydata() for line in ax.get_lines()])
-    near = shown[np.hypot(*(shown - here.mean(axis=0)).T) < 40.0]
+    shown = np.concatenate([line.get_xydata() for ax in axes for line in ax.get_lines()])
+    near = shown[np.hypot(*(shown - campus["map_spots_m"].mean(axis=0)).T) < 40.0]
     xlim, ylim = zip(near.min(axis=0) - 4.0, near.max(axis=0) + 4.0, strict=True)
-    plan_axes(ax, xlim=xlim, ylim=ylim)
-    return with_legend(page, ncols=2)
+    for ax in axes:
+        plan_axes(ax, xlim=xlim, ylim=ylim)
+    return page
 
 
 def clusters(drawn: dict[str, Arrays]) -> Figure:
@@ -94,6 +97,7 @@ def clusters(drawn: dict[str, Arrays]) -> Figure:
         ax.scatter(*nodes, c=colours, s=9, zorder=2)
         kind = f" ({_DESCRIPTORS[DRAWN_DESCRIPTOR]})" if name.startswith("campus") else ""
         plan_axes(ax, title=NAMES[name] + kind)
+    page.suptitle("nodes by the cluster of their descriptor, four colours in turn", size=9)
     return page
 
 
@@ -103,10 +107,10 @@ def map_and_route(drawn: dict[str, Arrays]) -> Figure:
     for ax, (name, place) in zip(axes, drawn.items(), strict=True):
         walls = list(place.get("walls_m", ()))
         ax.add_collection(LineCollection(walls, colors=WALL, linewidths=0.5))
-        ax.plot(*place["queries_m"].T, ".", color=RED, ms=2, label="queries")
-        ax.plot(*place["nodes_m"].T, ".", color=BLUE, ms=2, label="nodes of the map")
+        ax.plot(*place["nodes_m"].T, "o", color=BLUE, ms=4, mew=0, label="nodes of the map")
+        ax.plot(*place["queries_m"].T, "o", color=ORANGE, ms=1.6, mew=0, label="queries")
         plan_axes(ax, title=NAMES[name])
-    return with_legend(page, ncols=2, markerscale=4.0)
+    return with_legend(page, ncols=2, markerscale=2.0)
 
 
 def dispersion(table: pd.DataFrame) -> Figure:
@@ -124,7 +128,11 @@ def dispersion(table: pd.DataFrame) -> Figure:
         axes[1].set(xlabel="step")
     columns[0][0][0].set(ylabel="dispersion, m")
     columns[0][0][1].set(ylabel="error, m")
-    page.suptitle("line: median; band: the middle 80 % of the runs", size=9)
+    page.suptitle(
+        "line: median; band: the middle 80 % of the runs; what lies below an axis is drawn at its "
+        "lower end",
+        size=9,
+    )
     return with_legend(page, ncols=3)
 
 
@@ -145,6 +153,10 @@ def starts(routes: dict[str, Arrays]) -> Figure:
         top = 1000.0 if name.startswith("oxford") else 100.0  # room for the legend
         ax.set(xlabel="query", ylabel="error, m", title=NAMES[name], ylim=(0.0, top))
         ax.legend(loc="upper right", fontsize=8)
+    page.suptitle(
+        "mean of the repeats; ±: along the route; axis linear below the spacing of the nodes",
+        size=9,
+    )
     return page
 
 
@@ -161,7 +173,9 @@ def particles(route: Arrays) -> Figure:
         ax.plot(*robot, "+", color=RED, ms=14, mew=1.5, label="robot")
         ax.plot(*mean, "x", color=BLACK, ms=8, label="estimate")
         error = np.hypot(*(mean - robot))
-        plan_axes(ax, title=f"iteration {step}: on {len(places)} nodes, error {error:.1f} m")
+        plan_axes(
+            ax, title=f"iteration {step}: particles on {len(places)} nodes, error {error:.1f} m"
+        )
     return with_legend(page, ncols=4)
 
 
@@ -252,11 +266,10 @@ def campus_errors(starts_table: pd.DataFrame, retrieval: pd.DataFrame) -> Figure
     page.legend(*left.get_legend_handles_labels(), loc="outside lower left", ncols=4, fontsize=8)
     recall = retrieval.groupby("descriptor")[list(_RECALL)].mean().loc[list(describers.KINDS)]
     recall = recall.rename(columns=_RECALL, index=_DESCRIPTORS)
-    recall.plot.bar(ax=right, color=[BLUE, SKY], width=0.76, rot=0)
+    recall.plot.bar(ax=right, color=BLUE, width=0.5, rot=0, legend=False)
     for bars in right.containers:
         right.bar_label(bars, fmt="%.3f", fontsize=7)
-    right.set(xlabel="", ylim=(0.0, 1.0), ylabel="share of queries")
-    right.legend(loc="lower right", bbox_to_anchor=(1.0, 1.06), ncols=2)
+    right.set(xlabel="", ylim=(0.0, 1.0), ylabel="recall@1, share of queries")
     return page
 
 

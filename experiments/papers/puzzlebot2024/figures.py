@@ -169,8 +169,8 @@ def calibration(table: pd.DataFrame) -> Figure:
             ax.set_title(f"k = {k:g} m, {n:g} runs\n{arm}", fontsize="small")
     labels = [f"{_METHODS[method]}, {_PARAMETERS[name]}" for method, name in rows]
     ticks = {"yticks": range(len(rows)), "yticklabels": labels[::-1]}
-    axes[0, 0].set(xscale="log", xlim=(0.55, 6.5), **ticks)
-    plain_ticks(axes[0, 0], [0.7, 1.0, 1.5, 2.0, 3.0, 4.0])
+    axes[0, 0].set(xscale="log", xlim=(0.4, 6.5), **ticks)
+    plain_ticks(axes[0, 0], [0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 4.0])
     page.supxlabel(
         "estimate over the truth: histogram, its mean (dot), mean 95 % interval (bar);\n"
         "right: share of the intervals that hold the truth",
@@ -182,7 +182,7 @@ def calibration(table: pd.DataFrame) -> Figure:
 def _estimates(ax: Axes, part: pd.DataFrame, level: int, color: str) -> None:
     """Draw one method's estimates of one wheel at a height."""
     ratios = part["value"] / part["truth"]
-    counts, edges = np.histogram(ratios, bins=np.geomspace(0.55, 4.6, 86))
+    counts, edges = np.histogram(ratios, bins=np.geomspace(0.4, 4.6, 99))
     ax.stairs(level + 0.75 * counts / max(counts.max(), 1), edges, baseline=level, fill=True,
               color=color, alpha=0.5)  # fmt: skip
     ends = [float((part[end] / part["truth"]).mean()) for end in ("low", "high")]
@@ -213,17 +213,21 @@ def table_1(table: pd.DataFrame) -> Figure:
         slip.axvline(1e4 * share * TABLE_1_K_M, color=color, lw=0.9, ls=":")
     straight.set(
         title="end x",
-        xlabel="real less ideal, mm",
+        xlabel="real minus ideal, mm",
         yticks=table.index,
         yticklabels=map(_run, table.itertuples()),
     )
-    turned.set(title="end heading", xlabel="real less ideal, mrad")
-    slip.set(title="slip by this case alone", xlabel="1e-4 m (dotted: true)", xlim=(0.0, None))
-    slip.legend(loc="center", bbox_to_anchor=(0.6, 0.5), fontsize=8)
-    page.suptitle(
-        f"{CALIBRATION_RUNS} runs a case: mean and standard deviation; 95 % intervals", size=9
+    turned.set(title="end heading", xlabel="real minus ideal, mrad")
+    slip.set(
+        title="slip by this case alone",
+        xlabel="slip constant, 10$^{-4}$ m (dotted: true)",
+        xlim=(0.0, None),
     )
-    return page
+    page.suptitle(
+        f"{CALIBRATION_RUNS} runs a case; ends: mean and standard deviation; slip: 95 % interval",
+        size=9,
+    )
+    return with_legend(page, ncols=2, of=slip)
 
 
 def _run(row: Any) -> str:
@@ -252,7 +256,7 @@ def table_1_short_turns(table: pd.DataFrame) -> Figure:
         for row in table.itertuples()
     ]
     title = (
-        f"table 1 by the robot that turns short, {CALIBRATION_RUNS} runs a case; "
+        f"table 1 by the robot that under-rotates, {CALIBRATION_RUNS} runs a case; "
         f"the report: turns come out at {REPORTED_TURN_RATIO} of the ideal ones"
     )
     return draw_table(header, cells, title, (9.0, 3.4))
@@ -298,8 +302,7 @@ def short_turns(ends: pd.DataFrame, found: pd.DataFrame) -> Figure:
         )
     case_4 = float(ends.set_index("case").loc["angular_4", "ideal_heading_rad"])
     left.plot(case_4, REPORTED_ENDS["angular_4"], "x", color=BLACK, label="the report's example")
-    legend = {"loc": "upper left"}
-    set_axes(left, xlabel="turn commanded, rad", ylabel="turn driven, rad", legend=legend)
+    set_axes(left, xlabel="turn commanded, rad", ylabel="turn driven, rad")
     for i, row in enumerate(found.itertuples()):
         is_gain = row.parameter.startswith("bias")
         truth, *values = (
@@ -315,14 +318,13 @@ def short_turns(ends: pd.DataFrame, found: pd.DataFrame) -> Figure:
     right.axvline(1.0, color=BLACK, lw=0.8)
     set_axes(
         right,
-        xlabel="over the truth",
+        xlabel="estimate / true value",
         yticks=range(len(found)),
         yticklabels=[_FOUND[name] for name in found["parameter"]],
         ylim=(len(found) - 0.5, -0.6),
         title="by end poses alone",
-        legend={"loc": "center left"},
     )
-    return page
+    return with_legend(page, ncols=3, of=[left, right])
 
 
 _FOUND = {

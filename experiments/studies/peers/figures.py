@@ -7,6 +7,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.ticker import LogLocator
 
 from experiments.judging.results import Results
 from experiments.studies.peers.settings import CLASSES, LASER, MAP, STEREO, TUNED
@@ -61,6 +62,8 @@ def errors(methods: pd.DataFrame) -> Figure:
                 axes.plot([low, high], [y, y], color=colour, lw=1.2)
                 axes.plot(value, y, "o", ms=5, color=colour, mfc=filled)
             set_axes(axes, xscale="log", xlim=limits, ylim=(-0.7, len(part) - 0.3))
+            axes.xaxis.set_major_locator(LogLocator(numticks=20))
+            axes.tick_params(axis="x", labelsize=7)
             axes.grid(axis="y", color="0.92")
             axes.tick_params(axis="y", length=0)
             axes.set_yticks(at, [""] * len(part))
@@ -141,7 +144,7 @@ def _legend(test: str) -> list[Line2D]:
         for label, color, filled in [
             ("ours", BLUE, BLUE),
             ("another project's", ORANGE, ORANGE),
-            ("level with the best of its board", WALL, WALL),
+            ("not shown to be worse than the best of its board", WALL, WALL),
             (f"worse ({test})", WALL, "white"),
         ]
     ]

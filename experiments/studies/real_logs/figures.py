@@ -78,7 +78,7 @@ def mrclam(errors: pd.DataFrame, paths: Arrays) -> Figure:
     shown = [method for method in MRCLAM_SHOWN if method in by_method][::-1]
     for k, method in enumerate(shown):
         rows = by_method[method].groupby("robot")
-        for ax, values in ((left, rows.ate_rmse_m.mean()), (middle, rows.nees_mean.median())):
+        for ax, values in ((left, rows.ate_rmse_m.mean()), (middle, rows.nees_mean.median() / 3.0)):
             at = k + np.linspace(-0.22, 0.22, len(values))
             ax.plot(values, at, ".", ms=6, color=CYCLE[0])
             ax.plot(np.median(values), k, "|", ms=16, mew=1.6, color=BLACK)
@@ -89,8 +89,8 @@ def mrclam(errors: pd.DataFrame, paths: Arrays) -> Figure:
     middle.set_yticklabels([])
     left.set(xlabel="position RMSE after 300 s, m")
     left.set_title("MRCLAM 6: a dot a robot, a bar the median", fontsize="medium")
-    middle.set(xlabel="mean NEES (dotted: 3, consistent)")
-    middle.axvline(3.0, color=BLACK, lw=0.9, ls=":")
+    middle.set(xlabel="mean NEES / 3 (dotted: 1, consistent)")
+    middle.axvline(1.0, color=BLACK, lw=0.9, ls=":")
     plain_log(left.xaxis)
     for color, name in zip((BLACK, *CYCLE), ("motion capture", *MRCLAM_DRAWN), strict=False):
         right.plot(*paths[name].T, color=color, lw=0.8, label=name)
@@ -136,10 +136,12 @@ def wean(fits: pd.DataFrame, drawn: Arrays) -> Figure:
         ax.plot(*drawn[f"ends_{row.log}"].T, ".", color=CYCLE[4], ms=1.2, label="beam ends")
         ax.plot(*drawn[f"path_{row.log}"].T, color=CYCLE[0], lw=1.2, label="path (ICP)")
         ax.plot(row.x_m, row.y_m, "o", color=CYCLE[0], ms=4)
+        seen = np.concatenate([drawn[f"{name}_{row.log}"] for name in ("ends", "path")])
+        low, high = np.nanmin(seen, axis=0) - 2.0, np.nanmax(seen, axis=0) + 2.0
         plan_axes(
             ax,
-            xlim=drawn["extent_m"][:2],
-            ylim=drawn["extent_m"][2:],
+            xlim=np.clip((low[0], high[0]), *drawn["extent_m"][:2]),
+            ylim=np.clip((low[1], high[1]), *drawn["extent_m"][2:]),
             title=f"Wean Hall, log {row.log}: fit {row.score:.2f}, "
             f"start {math.degrees(row.yaw_rad):.0f}°",
         )

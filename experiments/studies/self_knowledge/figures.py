@@ -1,5 +1,8 @@
 """Figures of the study of self-knowledge."""
 
+import textwrap
+from typing import Any
+
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
@@ -8,8 +11,9 @@ from experiments.evaluation.alarm import Evidence, alarm_curve
 from experiments.judging.results import Results
 from experiments.studies.self_knowledge.planted import LIFTED
 from experiments.viewing.plotting import with_legend
-from experiments.viewing.style import SERIES, subplots
+from experiments.viewing.style import BLACK, CYCLE, WALL, subplots
 
+_USEFUL = 0.5  # share of losses missed, above which a curve is grey
 _CONSISTENT = 0.90, 0.99  # share inside the ellipsoid of 95 % that passes
 
 
@@ -45,19 +49,36 @@ def curves(said: pd.DataFrame) -> pd.DataFrame:
 
 
 def draw_alarms(table: pd.DataFrame) -> Figure:
-    """Share of losses missed against false alarms an hour, a line a method."""
-    page, axes = subplots(6.5, 4.0, 1, 1)
+    """Share of losses missed against false alarms an hour, a line a method.
+
+    Those that miss half of them at one false alarm an hour are grey.
+    """
+    page, axes = subplots(6.5, 4.4, 1, 1)
     known = table.dropna(subset=["missed", "false_per_h"])
     known = known[known["method"] != "smoother"]  # dead reckoning until it ends
-    for (method, part), (colour, _) in zip(known.groupby("method"), SERIES, strict=False):
-        label = f"{method} ({part['losses'].iloc[0]} losses)"
-        axes.step(part["false_per_h"], part["missed"], where="post", color=colour, label=label)
-    axes.axvline(1.0, color="#999999", lw=0.8, ls=":")
+    missed = known[known["false_per_h"] <= 1.0].groupby("method")["missed"].min()
+    colours, poor = iter(CYCLE), list[str]()
+    for method in missed.sort_values().index:
+        part = known[known["method"] == method]
+        style: dict[str, Any] = {"color": WALL, "lw": 0.8, "alpha": 0.6, "zorder": 1}
+        if missed[method] < _USEFUL:
+            label = f"{method} ({part['losses'].iloc[0]} losses)"
+            style = {"color": next(colours), "lw": 2.0, "label": label}
+        else:
+            poor.append(str(method))
+        axes.step(part["false_per_h"], part["missed"], where="post", **style)
+    if poor:
+        axes.plot([], [], color=WALL, lw=0.8, label=textwrap.fill(", ".join(poor), 70))
+    axes.axvline(1.0, color=BLACK, lw=0.8, ls=":", label="one false alarm an hour")
     axes.set_xscale("symlog", linthresh=1.0)
     axes.set_xlim(0.0, 1.1 * known["false_per_h"].max())
     axes.set_xticks([0.0, 1.0, 10.0, 100.0], ["0", "1", "10", "100"])
-    axes.set(xlabel="false alarms an hour", ylabel="share of losses missed", ylim=(-0.02, 1.02))
-    return with_legend(page, ncols=2)
+    axes.set(
+        xlabel="false alarms an hour (linear up to 1, logarithmic beyond)",
+        ylabel="share of losses missed",
+        ylim=(-0.02, 1.02),
+    )
+    return with_legend(page, ncols=1)
 
 
 def draw_coverage(table: pd.DataFrame) -> Figure:
@@ -82,15 +103,17 @@ def draw_coverage(table: pd.DataFrame) -> Figure:
 def draw_wean(table: pd.DataFrame, curve: pd.DataFrame) -> Figure:
     """What `mcl` says over a real log, as logged and with wheels that are lifted."""
     page, (above, below) = subplots(6.5, 4.2, 2, 1, sharex=True)
-    time_s, (logged, _), (lifted, _) = table["stamp_s"], *SERIES[:2]
+    time_s, logged, lifted = table["stamp_s"], *CYCLE[:2]
     above.plot(time_s, table["apart_m"], color=lifted)
     above.set(ylabel="distance between\nthe two paths, m", ylim=(0.0, None))
-    below.plot(time_s, table["lost_lifted"], color=lifted, lw=0.8, label="with wheels lifted")
+    below.plot(
+        time_s, table["lost_lifted"], color=lifted, lw=0.8, label="wheels lifted for a while"
+    )
     below.plot(time_s, table["lost"], color=logged, lw=0.8, label="as logged")
     own = curve[(curve["method"] == "mcl") & (curve["false_per_h"] <= 1.0)]
     threshold = own["threshold"].min()
-    below.axhline(threshold, color="#999999", lw=0.8, ls=":", label="one false alarm an hour")
+    below.axhline(threshold, color="#999999", lw=0.8, ls=":", label="alarm (set in simulation)")
     for axes in (above, below):
-        axes.axvspan(*np.quantile(time_s, LIFTED), color="#eeeeee", lw=0)
-    below.set(xlabel="time, s", ylabel="lost", ylim=(0.0, 1.02))
-    return with_legend(page, ncols=3, of=below)
+        axes.axvspan(*np.quantile(time_s, LIFTED), color="#e0e0e0", lw=0, label="wheels lifted")
+    below.set(xlabel="time, s", ylabel="misfit of the scan\n(`lost`)", ylim=(0.0, 1.02))
+    return with_legend(page, ncols=4, of=below)

@@ -50,5 +50,5 @@ def test_figure_shows_each_arm():
     named = [text.get_text() for text in page.axes[2].get_legend().get_texts()]
     assert named == ["as it is", "four times the slip"]
     shared = [text.get_text() for text in page.legends[0].get_texts()]
-    assert shared == ["M = 10", "EKF-SLAM", "batch"]
+    assert shared == ["M = 10", "EKF-SLAM", "batch least squares", "consistent: 0.79"]
     assert "fastslam_consistency" in reproduce._chosen(None)
