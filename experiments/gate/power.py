@@ -383,7 +383,8 @@ def measured_text(
         f"drawn from the pool ({power['checks'].iloc[0]} each):",
         "",
         to_markdown(pd.DataFrame([_fault(row) for row in power.to_dict("records")])),
-        "![The smallest rise that 95 % of checks find, of each estimator and fault; dashed: the goal]"
+        "![The smallest rise that 95 % of checks find, of each estimator and fault; dashed: "
+        "the goal]"
         "(figures/regression.png)",
         "",
         f"All faults together: {100 * overall.value:.1f} % found (95 %: {100 * overall.low:.1f} to "

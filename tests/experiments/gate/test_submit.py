@@ -1,15 +1,24 @@
 """Submissions: read from their folder, built, checked and scored alone."""
 
+import dataclasses
 import json
 import shutil
+import sys
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pytest
 
 from experiments.gate import submit
 from experiments.gate.conform import CheckResult
-from experiments.gate.submit import check_submission, read_submission, summary, table_of
+from experiments.gate.submit import (
+    check_submission,
+    failures,
+    read_submission,
+    summary,
+    table_of,
+)
 from sim.errors import InputError
 
 EXAMPLE = Path(__file__).parents[3] / "docs" / "examples" / "external_odometry.py"
@@ -71,7 +80,7 @@ def test_a_class_runs_in_a_process_of_its_own(folder, quick):
     (folder / "theirs.py").write_text(
         "import os, pathlib\n"
         "from estimators.odometry import Odometry\n"
-        "pathlib.Path(__file__).with_name('pid').write_text(str(os.getpid()))\n"
+        f"pathlib.Path({str(folder / 'pid')!r}).write_text(str(os.getpid()))\n"
         "class Theirs(Odometry):\n    pass\n"
     )
     (folder / "submission.yaml").write_text(
@@ -111,6 +120,13 @@ def test_a_program_that_dies_fails_and_is_named(folder, quick):
         ("license: MIT", "license: MIT\nbuild: ['false']", "its build failed"),
         ("license: MIT", "license: MIT\nbuild: [no_such_compiler]", "build cannot be run"),
         ("name: mine", "name: [", "not valid YAML"),
+        ("license: MIT", "license: as you like", "license must be an SPDX identifier"),
+        ("https://example.org/mine", "javascript:alert(1)", "address must be an address"),
+        ("filter.py]", "filter.py, 500]", 'got 500: write it in quotes, "500"'),
+        ("filter.py]", "'--kr=${robot.kr}']", "is not resolved in a submission"),
+        ("[python3, filter.py]", "[filter.py]", "filter.py is not executable; chmod"),
+        ("filter.py]", "filter.py]\n  step_s: 11.0", "step_s is at most 10 s"),
+        ("license: MIT", "license: MIT\nbuild: [sh, -c, 'echo oh; exit 3']", "code 3: oh"),
     ],
 )
 def test_what_is_wrong_is_named(folder, quick, before, after, said):
@@ -130,6 +146,65 @@ def test_a_folder_without_a_submission_is_named(tmp_path):
 def test_what_is_no_folder_to_write_is_named_before_anything_runs(folder, quick):
     with pytest.raises(InputError, match=r"submission\.yaml: not a folder"):
         check_submission(folder, folder / "submission.yaml", drives=1)
+
+
+def test_nothing_of_the_folder_runs_in_the_judge(folder, quick):
+    """Hydra imports plugins that it finds, and a program needs none."""
+    (folder / "hydra_plugins.py").write_text("raise SystemExit('I am in')\n")
+    score, _ = check_submission(folder, drives=1, seed=5)
+    assert score.passed
+    assert "hydra_plugins" not in sys.modules or "mine" not in str(sys.modules["hydra_plugins"])
+
+
+def test_a_program_runs_in_a_copy_of_its_folder_and_finds_no_recording(folder, quick):
+    before = sorted(p.name for p in folder.iterdir())
+    text = (folder / "filter.py").read_text()
+    (folder / "filter.py").write_text("open('made.txt', 'w').write('x')\n" + text)
+    found = []
+    for seed in (5, 6):
+        score, out = check_submission(folder, drives=1, seed=seed)
+        assert score.passed
+        found.append(sorted(out.parents[1].rglob("*.npz")))  # of the checks
+    assert sorted(p.name for p in folder.iterdir()) == before
+    assert found[0] == found[1]
+
+
+def test_one_drive_that_fails_leaves_its_class_without_a_ratio(folder, quick):
+    text = (folder / "filter.py").read_text()
+    (folder / "filter.py").write_text(f"import sys\nsys.path.insert(0, '.')\n{text}")
+    score, _ = check_submission(folder, drives=2, seed=5)
+    rows = score.rows.copy()
+    own = rows.index[rows["choice.estimator"] == "mine"]
+    rows.loc[own[0], ["status", "status_detail", "ate_rmse_m"]] = ["failed", "out of luck", None]
+    lost = dataclasses.replace(score, rows=rows)
+    (line,) = table_of(lost).to_dict("records")
+    assert line["failed"] == 1
+    assert np.isnan(line["error over odometry's"])
+    assert failures(lost) == ["1 drive failed: out of luck (first: rooms, seed 5)"]
+
+
+def test_a_whole_log_counts_by_its_revised_path(folder, quick):
+    score, _ = check_submission(folder, drives=1, seed=5)
+    rows = score.rows.copy()
+    rows["revised_ate_rmse_m"] = [130.0 if n == "mine" else None for n in rows["choice.estimator"]]
+    (line,) = table_of(dataclasses.replace(score, rows=rows)).to_dict("records")
+    assert line["error, m"] == pytest.approx(130.0)
+
+
+def test_scores_of_somebody_else_are_not_overwritten(folder, quick):
+    check_submission(folder, drives=1, seed=5)
+    check_submission(folder, drives=1, seed=5)
+    (folder / "submission.yaml").write_text(SAID.replace("example.org/mine", "example.org/other"))
+    with pytest.raises(InputError, match=r"holds the scores of https://example.org/mine"):
+        check_submission(folder, drives=1, seed=5)
+
+
+def test_without_passing_the_checks_nothing_is_driven(folder, quick, monkeypatch):
+    failed = [CheckResult("one", False, "wrong")]
+    monkeypatch.setattr(submit, "check_estimator", lambda *_, **__: failed)
+    score, _ = check_submission(folder, drives=1)
+    assert not len(score.rows)
+    assert summary(score) == "mine: 1 check failed; no drives, as the checks come first"
 
 
 @pytest.mark.slow
