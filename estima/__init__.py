@@ -17,6 +17,8 @@ from __future__ import annotations
 import hashlib
 import importlib
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypedDict, Unpack, overload
@@ -316,10 +318,11 @@ def sweep(*overrides: str, name: str | None = None) -> pd.DataFrame:
     from experiments.sweeps.collect import collect
 
     own = f"sweep_{hashlib.sha256(repr(overrides).encode()).hexdigest()[:8]}"
-    named = [line.partition("=")[2] for line in overrides if line.startswith("name=")]
+    named = [str(line).partition("=")[2] for line in overrides if str(line).startswith("name=")]
     folder = name or (named or [own])[-1]
     try:
-        launch.sweep([*overrides, f"name={folder}"])
+        with _checked(overrides):
+            launch.sweep([*overrides, f"name={folder}"])
     except RunFailedError as error:
         warnings.warn(str(error), stacklevel=2)
     return collect(folder)
@@ -397,7 +400,28 @@ def plot(
 def _experiment(overrides: tuple[str, ...]) -> Experiment:
     from experiments.runs.experiment import Experiment
 
-    return Experiment.compose(overrides)
+    with _checked(overrides):
+        return Experiment.compose(overrides)
+
+
+@contextmanager
+def _checked(overrides: tuple[str, ...]) -> Iterator[None]:
+    """What is wrong with overrides becomes the InputError that is documented."""
+    from experiments.runs.console import as_input_error
+    from sim.errors import require
+
+    for each in overrides:
+        require(
+            isinstance(each, str),
+            f"an override is a text such as 'seed=1', got a {type(each).__name__}; give those of a "
+            "list one by one: *overrides",
+        )
+    try:
+        yield
+    except Exception as error:
+        if (refused := as_input_error(error)) is None:
+            raise
+        raise refused from error
 
 
 def _raise(error: BaseException) -> None:

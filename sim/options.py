@@ -195,7 +195,8 @@ def find(target: Any, where: str) -> Callable[..., Any]:
     """
     require(
         isinstance(target, str) and "." in target,
-        f"{where}._target_ must name a class or function, such as mine.Mine",
+        f"{where}._target_ must name a class or function, such as mine.Mine"
+        + ("; a file of walls is world=from_file world.path=FILE" if where == "world" else ""),
     )
     module_name, _, name = target.rpartition(".")
     with blaming(f"{where}._target_={target}"):  # what its module does when it is imported

@@ -41,11 +41,18 @@ def options(
 
       estima options laser (a sensor; or that of a preset: lms291.laser)
 
+      estima options simulation (keys without options: prior, people, scoring too)
+
       estima options metrics
     """
+    from experiments.runs.schema import OPTIONS, describe_option
+
     if group == "metrics":
         require(name is None, f"{name}: metrics have no options of their own")
         show(columns.as_text())
+        return
+    if group in OPTIONS and name is None:
+        show(describe_option(group, group))
         return
     if group is not None and name is None and group not in completion.GROUPS:
         group, name = _group_of(group, config_dir), group
@@ -60,6 +67,7 @@ def options(
         return
     for one in completion.GROUPS:
         print(f"{one:>10}: {', '.join(completion.options(one, config_dir))}")
+    print(f"{'keys':>10}: {', '.join(OPTIONS)}")
     print("Next: estima options GROUP says what each is, estima options NAME its keys.")
 
 
@@ -94,9 +102,11 @@ def _groups_of(name: str, config_dir: Path | None) -> list[str]:
 
 def _group_of(name: str, config_dir: Path | None) -> str:
     """The one group of an option or a sensor that is called by its name alone."""
+    from experiments.runs.schema import OPTIONS
+
     groups = _groups_of(name, config_dir)
     options = [n for g in completion.GROUPS for n in completion.options(g, config_dir)]
-    known = [*completion.GROUPS, "metrics", *options]
+    known = [*completion.GROUPS, *OPTIONS, "metrics", *options]
     listed = nearest(name, known)
     remedy = "; `estima options` lists all" if listed.endswith(" more") else ""
     require(groups, f"no group or option {name}; {listed}{remedy}")

@@ -129,6 +129,8 @@ def main() -> None:
         _check_environment()
         try:
             words = _own_first(sys.argv[1:])
+            folders = [w for w in words if w.partition("=")[0] in ("--config-dir", "-cd")]
+            require(len(folders) < 2, "--config-dir twice; put the options into one folder")
             _only_named(words)(words)
         finally:
             with suppress(ValueError):  # an estimator has closed it

@@ -32,6 +32,10 @@ class Matching:
     tolerance_s: Annotated[
         float | None, typer.Option("--tolerance", help="Greatest difference of nearest stamps, s.")
     ] = None
+    truth_gap_s: Annotated[
+        float | None,
+        typer.Option("--truth-gap", help="Longest gap of the truth to interpolate over, s."),
+    ] = None
     offset_s: Annotated[
         float | None, typer.Option("--offset", help="Added to the trajectory's stamps, s.")
     ] = None

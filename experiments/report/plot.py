@@ -150,7 +150,8 @@ def sweep_figure(
                 lw=1.2, ls="-" if shown.joined else "none", label=label,
             )  # fmt: skip
             below = _rows_of(least, {**panel, **line})
-            ax.plot(*places(below[x], below["value"]), ":", color=colour, lw=1)
+            alone_at = {"marker": "|" if sideways else "_", "ms": 16} if len(below) == 1 else {}
+            ax.plot(*places(below[x], below["value"]), ":", color=colour, lw=1, **alone_at)
             ax.plot(*places(alone[x], alone[y]), ".", color=colour, ms=4, alpha=0.5)
         words = (_named(name, value, texts[name]) for name, value in panel.items())
         ax.set_title("; ".join(words), fontsize="medium")

@@ -71,10 +71,10 @@ def notes(found: pd.DataFrame, against: str | None) -> str:
         parts.append(
             f"*: differs from {against} (paired t tests over recordings; 5 % for the table, Holm)."
         )
-    elif against and found["runs"].max() < _TESTED:
-        parts.append(f"Too few recordings to test what differs from {against}.")
     elif against:
-        parts.append(f"Nothing differs from {against} by paired tests.")
+        few = "; so few recordings show large differences only"
+        few *= bool(found["runs"].max() < _TESTED)
+        parts.append(f"Nothing differs from {against} by paired tests{few}.")
     if against:
         parts.append("The interval of a ratio holds 95 % by itself, without Holm's correction.")
     if BELOW in found:

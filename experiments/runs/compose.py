@@ -8,6 +8,7 @@ import sys
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +40,7 @@ from sim.files import read_text, sha256_of, write_text
 from sim.yaml_file import read_yaml
 
 _SEARCHED = "hydra.searchpath="
+_OF_STUDIES = ("study", "sweeps", "tune", "team")  # top-level keys beside those of a run
 _READ_OF_HYDRA = ("hydra/launcher", "hydra.launcher", "hydra.searchpath")
 _REMEDIES = {  # by the beginning of a setting that nothing reads
     "hydra/sweeper": "-m runs every combination of the values; an optimizer may call estima.sweep "
@@ -197,6 +199,7 @@ class Composer:
             for override in targets:
                 set_value(cfg, override.key_or_group, override.value())
             self._check(cfg)
+            _check_stated(cfg, choices.get("study"))
             fill(cfg)
             for override in options:
                 deleted = override.is_delete() and value_at(cfg, override.key_or_group) is not None
@@ -422,6 +425,17 @@ def _check_added(overrides: Sequence[Override], groups: Collection[str]) -> None
             require(key in KEYS or override.key_or_group in groups, describe_unknown(key, KEYS))
 
 
+def _check_stated(cfg: DictConfig, study: str | None) -> None:
+    """Check that a study's keys are read, or are labels of its own, which hold one value."""
+    known = (*KEYS, *_OF_STUDIES)
+    for key, value in cfg.items_ex(resolve=False):
+        one = not isinstance(value, DictConfig | ListConfig)
+        require(
+            key in known or (one and not get_close_matches(str(key), known, cutoff=0.75)),
+            f"study={study}: {describe_unknown(str(key), known)}",
+        )
+
+
 def check_overrides(overrides: Sequence[str]) -> None:
     """Check what Hydra itself does not.
 
@@ -435,6 +449,8 @@ def check_overrides(overrides: Sequence[str]) -> None:
     """
     for text in overrides:
         key = text.lstrip("+~").partition("=")[0]
+        known = f"a file? recording={text} takes it" if Path(text).suffix else f"such as {key}=1"
+        require("=" in text or text[:1] == "~", f"{text}: write KEY=VALUE; {known}")
         remedy = next(said for start, said in _REMEDIES.items() if key.startswith(start))
         require(
             re.match(r"hydra\b", key) is None or key.startswith(_READ_OF_HYDRA),
@@ -453,7 +469,7 @@ def check_overrides(overrides: Sequence[str]) -> None:
                 scheme, _, place = str(getattr(entry, "text", entry)).rpartition("://")
                 there = scheme not in ("", "file") or Path(place).is_dir()
                 require(there, f"{override.input_line}: no folder {place}")
-        named = override.is_sweep_override() or isinstance(value, str)
+        named = override.is_sweep_override() or (isinstance(value, str) and value)
         listed = (
             f"; for one run each, -m {key}={value[0]},..."
             if isinstance(value, list) and value

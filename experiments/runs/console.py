@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import math
 import os
+import re
 import signal
 import sys
 import textwrap
@@ -140,12 +141,8 @@ def exit_with(error: BaseException) -> NoReturn:
             for again in (signal.SIGINT, signal.SIGTERM):  # what is said is said whole
                 signal.signal(again, signal.SIG_IGN)
             _say(str(link) or "interrupted; what a sweep, study or check has finished is kept", 130)
-        if isinstance(link, _configuration_errors()):
-            if refusal := _refusal(link):
-                _say(refusal, 2)
-            lines = [line.strip() for line in str(link).splitlines() if line.strip()]
-            text = textwrap.shorten(" ".join(lines), 600, placeholder=" ...")
-            _say(f"configuration: {text}; see estima run --cfg job", 2)
+        if (refused := as_input_error(link)) is not None:
+            _say(str(refused), 2)
         if isinstance(link, OSError) and link is error:
             _say_system(link)
         if isinstance(link, MemoryError):
@@ -154,6 +151,20 @@ def exit_with(error: BaseException) -> NoReturn:
             _say("configuration: the defaults of an option lead back to itself", 2)
     traceback.print_exception(error)
     sys.exit(3)
+
+
+def as_input_error(error: BaseException) -> InputError | None:
+    """What Hydra refuses, as an error of ours; None of another error."""
+    if not isinstance(error, _configuration_errors()):
+        return None
+    if refusal := _refusal(error):
+        return InputError(refusal)
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    text = textwrap.shorten(" ".join(lines), 600, placeholder=" ...")
+    if deleted := re.search(r"Could not delete from config\. '([\w.]+)' does not exist", text):
+        key = deleted.group(1)
+        return InputError(f"~{key}: a key cannot be left out; set it, such as {key}=null")
+    return InputError(f"configuration: {text.rstrip('.')}; see estima run --cfg job")
 
 
 def _say_system(error: OSError) -> NoReturn:

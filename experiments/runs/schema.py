@@ -265,6 +265,8 @@ def describe_option(group: str, name: str, searched: Sequence[str] = ()) -> str:
     InputError
         If the group or sensor is unknown, or what the option names cannot be found.
     """
+    if group in OPTIONS:
+        return "\n".join([group, *_said(OPTIONS[group], {})])
     require(group in GROUPS, f"no group {group}; there are: {', '.join(GROUPS)}")
     kind = sensor_class(name) if group == "sensors" else None
     if kind is not None:

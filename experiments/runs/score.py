@@ -13,6 +13,7 @@ import numpy as np
 
 from estimators.base import Estimate
 from experiments.evaluation.metrics import (
+    LONGEST_GAP_S,
     RPE_DISTANCES_M,
     alignment,
     describe_pause,
@@ -56,6 +57,8 @@ class Scoring:
     stamps with the other's."""
     tolerance_s: NonNegative = 0.01
     """Greatest difference of stamps that match, of `nearest`."""
+    truth_gap_s: NonNegative = LONGEST_GAP_S
+    """Longest gap of the truth in which `interpolated` takes a true pose."""
     offset_s: float = 0.0
     """Added to the trajectory's stamps."""
     revised: bool = False
@@ -109,7 +112,7 @@ def match_and_align(recording: Recording, given: Estimate, how: Scoring) -> Scor
         rows, true_rows = _associated(stamps, recording.known_truth.stamps, how.tolerance_s)
         truth = recording.known_truth.poses[true_rows]
     else:
-        known = recording.truth_at(stamps)
+        known = recording.truth_at(stamps, how.truth_gap_s)
         rows = np.flatnonzero(np.isfinite(known).all(axis=1))
         truth = known[rows]
     start, end = recording.frame_stamps[[0, -1]]
@@ -118,7 +121,8 @@ def match_and_align(recording: Recording, given: Estimate, how: Scoring) -> Scor
         len(rows) >= _FEWEST_POSES,
         f"{len(np.unique(rows))} of {len(stamps)} poses meet the truth, at least {_FEWEST_POSES} "
         f"must: the trajectory is from {stamps[0]:.13g} to {stamps[-1]:.13g} s, the truth from "
-        f"{true_start:.13g} to {true_end:.13g} s; write stamps in seconds, or set an offset",
+        f"{true_start:.13g} to {true_end:.13g} s; write stamps in seconds, set an offset, or raise "
+        f"the gap of the truth that is bridged, {how.truth_gap_s:g} s",
     )
     means, covariances = given.means[rows], given.covariances[rows]
     T = np.zeros(3)
@@ -308,7 +312,7 @@ def describe_scoring(scored: ScoredTrajectory, how: Scoring) -> str:
     """Say what was scored: stamps, gaps, alignment."""
     stamps = scored.estimate.stamps
     matching = (
-        "the truth is interpolated at their stamps"
+        f"the truth is interpolated at their stamps, over at most {how.truth_gap_s:g} s"
         if how.match == "interpolated"
         else f"each with the nearest true stamp within {how.tolerance_s:g} s"
     )

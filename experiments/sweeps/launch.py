@@ -191,14 +191,18 @@ def _launch_all(plan: Plan, runs: Numbers, jobs: Jobs, launching: Sequence[str])
     write_text(jobs.plan, json.dumps({"planner": [platform.node(), os.getpid()]}))
     try:
         with _watched(jobs, len(runs)):
-            left = runs
+            left, again = runs, False
             while len(left):
                 died = _launch(plan, left, jobs, launching)
                 if died is None:
                     return
                 begun = store.find_begun_runs(jobs.folder, f"rows-{jobs.name}")
-                if not begun:
-                    raise died
+                if not begun and again:
+                    raise RunFailedError(
+                        "a process died twice before its first run, perhaps for want of memory; "
+                        "try hydra.launcher.n_jobs=1"
+                    ) from died
+                again = True
                 for i in left[np.isin(plan.keys[left], np.array(list(begun), np.uint64))]:
                     one = np.array([i])  # which of them was it?
                     if _launch(plan, one, jobs, [*launching, "hydra.launcher.n_jobs=2"]):

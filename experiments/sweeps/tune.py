@@ -266,7 +266,8 @@ def _problem(study: str, name: str, tuning: Tuning, config_dir: str | None) -> _
     judged = list(plan_experiments(common, config_dir))
     require(
         all(e.seed >= FIRST_JUDGED_SEED for e in judged),
-        f"study={study}: its own seeds are judged, and must be {FIRST_JUDGED_SEED} or more",
+        f"study={study}: its own seeds are judged, and must be {FIRST_JUDGED_SEED} or more; set "
+        "seed under hydra.sweeper.params, since `sweeps` is not read here",
     )
     drives[0].check()
     options, ranges = drives[0].options_of("estimator"), tuning.estimators[name]

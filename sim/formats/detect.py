@@ -106,7 +106,7 @@ FORMATS = (
         n_files=(1, 2),
     ),
     LogFormat(
-        "intel, thinned",
+        "intel (thinned)",
         lambda *paths: read_thinned_intel(*paths)[0],
         has_text=lambda _, lines: bool(lines) and len(lines[0].split()) == N_THINNED_BEAMS,
         n_files=(3, 3),

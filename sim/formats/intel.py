@@ -156,7 +156,7 @@ def read_thinned_intel(
         _scanner(1.0, N_THINNED_BEAMS, _THINNED_MAX_RANGE_M),
         None,
         RobotGeometry(wheel_radius_m, track_m),
-        {"source": "intel, thinned", "notes": notes, "stamps_known": rows.tolist()},
+        {"source": "intel (thinned)", "notes": notes, "stamps_known": rows.tolist()},
     )
     return recording, rows.astype(np.int64)
 

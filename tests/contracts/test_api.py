@@ -228,3 +228,20 @@ def test_a_failed_run_of_a_sweep_is_a_warning_and_a_row():
     assert "collision" in table["status_detail"][0]
     with pytest.raises(estima.InputError):
         estima.plot(table, x="seed")
+
+
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        (lambda: estima.simulate("world=ofice"), "no world named ofice; did you mean office"),
+        (lambda: estima.run("nope.npz"), "a file. recording=nope.npz takes it"),
+        (lambda: estima.run("seed"), "seed: write KEY=VALUE"),
+        (lambda: estima.run(estimator="ekf"), "no estimator named ekf; did you mean"),
+        (lambda: estima.sweep("estimator=odometri"), "no estimator named odometri"),
+        (lambda: estima.sweep(["seed=0,1"]), "give those of a list one by one"),
+    ],
+)
+def test_wrong_input_is_the_documented_error(call, said):
+    with pytest.raises(estima.InputError, match=said) as caught:
+        call()
+    assert "\n" not in str(caught.value)

@@ -6,8 +6,10 @@ import shutil
 import pytest
 
 from experiments.runs import paths, schema
+from experiments.runs.compose import searched
 from experiments.runs.dependencies.recorder import recorded
 from experiments.runs.experiment import Experiment
+from sim.errors import InputError
 
 SHORT = ["simulation.physics=kinematic", "world=office"]
 
@@ -56,3 +58,22 @@ def test_dependencies_have_the_files_of_what_is_kept():
     with recorded() as recorder:
         Experiment.compose(SHORT)
     assert {"conf/config.yaml", "conf/world/office.yaml"} <= recorder.digests().keys()
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("simulatoin: {physics: kinematic}", "unknown key simulatoin; did you mean simulation"),
+        ("sweep: {seed: 1}", "unknown key sweep; did you mean sweeps"),
+        ("bogus: {sed: [1, 2]}", "unknown key bogus"),
+        ("sede: 3", "unknown key sede; did you mean seed"),
+    ],
+)
+def test_a_studys_own_keys_are_labels_alone(tmp_path, line, said):
+    (tmp_path / "study").mkdir()
+    (tmp_path / "study" / "mine.yaml").write_text(f"# @package _global_\nlabel: a\n{line}\n")
+    words = [*searched(tmp_path), "study=mine"]
+    with pytest.raises(InputError, match=f"study=mine: {said}"):
+        Experiment.compose(words)
+    (tmp_path / "study" / "mine.yaml").write_text("# @package _global_\nlabel: a\n")
+    assert Experiment.compose(words).config["seed"] == 0

@@ -21,6 +21,7 @@ from sim.formats.relations import Relations, write_relations
 from sim.formats.trajectory import read_track, sound_covariances
 from sim.recording import load, save
 from tests.fixtures import fakes
+from tests.fixtures.fakes import circle
 
 _EVO = ("rmse", "mean", "median", "std", "min", "max", "sse")
 
@@ -450,3 +451,19 @@ def test_of_a_thinned_log_only_known_stamps_are_judged():
     poses = recording.truth_at(scans)
     assert relation_scores(recording, relations, scans, poses)["n_relations"] == 2
     assert relation_scores(known, relations, scans, poses)["n_relations"] == 1
+
+
+def test_gaps_of_the_truth_are_not_bridged():
+    """As in a run: `scoring.longest_gap_s`."""
+    recording = circle(n_frames=100)
+    stamps = recording.known_truth.stamps
+    kept = (stamps < stamps[40]) | (stamps > stamps[60])
+    truth = dataclasses.replace(
+        recording.known_truth, stamps=stamps[kept], poses=recording.known_truth.poses[kept]
+    )
+    holed = dataclasses.replace(recording, truth=truth)
+    given = Estimate(stamps, recording.known_truth.poses, np.zeros((len(stamps), 3, 3)))
+    gap_s = float(stamps[61] - stamps[39])
+    scored = match_and_align(holed, given, Scoring(truth_gap_s=0.99 * gap_s))
+    assert scored.n_left_out == 21
+    assert match_and_align(holed, given, Scoring(truth_gap_s=1.01 * gap_s)).n_left_out == 0
