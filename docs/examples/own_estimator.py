@@ -1,7 +1,7 @@
 """Your own estimator: any object with `reset` and `step`.
 
 This one reckons from the wheels and says that its errors grow by a fixed variance per metre. To
-sweep it, or to name it on the command line, give it a YAML with `_target_` (see the README).
+sweep it, or to name it on the command line, give it a YAML with `_target_` (docs/tutorial.md).
 """
 
 import numpy as np

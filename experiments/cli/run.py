@@ -29,7 +29,7 @@ def run(
 ) -> None:
     """Make or read a recording, run an estimator over it, and write its row of results.
 
-    With -o it also writes the estimate, the revised one of an estimator that has it. The other
+    With -o it also writes the estimate: the revised path, if the estimator gives one. The other
     arguments are Hydra's: `group=option`, `key=value`, `-m` for a sweep over values.
 
     Examples

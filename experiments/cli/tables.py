@@ -103,7 +103,7 @@ def table(
 
       estima table slip --rows -o slip.csv
     """
-    from experiments.report import of_sweep
+    from experiments.report import table as report_table
     from experiments.report.table import check_name
 
     check_name(out, size)
@@ -113,11 +113,11 @@ def table(
     timed = beside.times or any(column.endswith("_time_us") for column in metric or [])
     rows = _rows(name, kept, timed)
     if every and out is not None:
-        show(of_sweep.write_rows(rows, out))
+        show(report_table.write_rows(rows, out))
     else:
         named = metric or []
         over = beside.efficiency
-        show(of_sweep.table_of(rows, name, out, against, named, size, efficiency=over))
+        show(report_table.table_of(rows, name, out, against, named, size, efficiency=over))
 
 
 @dataclass(frozen=True)

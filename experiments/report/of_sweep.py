@@ -1,4 +1,4 @@
-"""Output from a sweep's rows: a table, a chart or a page, as text or a file."""
+"""Output from a sweep's rows: a chart or a page. Tables are `report.table`'s."""
 
 from __future__ import annotations
 
@@ -13,58 +13,17 @@ from experiments.judging.results import reproduce_command
 from experiments.report.contents import write_report
 from experiments.report.plot import Size, sweep_figure
 from experiments.report.sweep_page import extremes, picture_path, write_sweep_page
-from experiments.report.table import as_lines, notes, statuses, write_table
 from experiments.runs import paths
-from experiments.runs.columns import ANSWER
 from experiments.runs.console import pluralize, progress, show, warn
-from experiments.runs.row import Outcome, write_frame
+from experiments.runs.row import Outcome
 from experiments.sweeps.again import draw_recorded_run, short_key
 from experiments.sweeps.collect import folder_of, suggest_axes, unfinished_sweeps
-from experiments.sweeps.summary import ERROR, summary
-from experiments.sweeps.winner import find_winner
 from experiments.sweeps.work import may_run
 from experiments.viewing.play import Showing
 from experiments.viewing.style import save_figure
 from sim.errors import InputError, require
 
 FOLLOW_S = 5.0  # how often a page of a running sweep is written again
-
-
-def write_rows(rows: pd.DataFrame, out: Path) -> str:
-    """Write every row, with all its columns; say how many."""
-    write_frame(rows, out)
-    return f"{out}: {pluralize(len(rows), 'row')}, {len(rows.columns)} columns"
-
-
-_NARROW = (ERROR, f"{ANSWER}nees_mean")
-
-
-def table_of(
-    rows: pd.DataFrame,
-    name: str,
-    out: Path | None,
-    against: str | None,
-    metrics: Sequence[str],
-    size: str | None,
-    *,
-    efficiency: bool = False,
-) -> str:
-    """Mean errors of a sweep as lines, or in a file; then it says how many rows that has."""
-    narrow = size == "column" and not metrics  # one table as wide as a column
-    if narrow:  # with `against`, the ratio of the errors takes the place of the NEES
-        metrics = [m for m in _NARROW[: 1 if against else 2] if m.removeprefix(ANSWER) in rows]
-    found = summary(rows, against, metrics, efficiency=efficiency)
-    found = found.assign(with_remarks=0) if narrow else found
-    note = notes(found, against)
-    if out is not None:
-        write_table(found, note, out, Path(name).name, size)
-        return f"{out}: {pluralize(len(found), 'row')}"
-    lines = as_lines(found, note)
-    if not metrics and (winner := find_winner(rows)):
-        lines += "\n\n" + "\n".join(winner.sentences())
-    if (rows["status"] != Outcome.OK).any():
-        lines += "\n\n" + "\n".join(f"{count} {words}" for words, count in statuses(rows))
-    return lines
 
 
 @dataclass(frozen=True)

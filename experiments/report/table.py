@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import pandas as pd
@@ -19,9 +20,11 @@ from experiments.report.export import (
     written,
 )
 from experiments.report.page import render
-from experiments.runs.columns import PATH
+from experiments.runs.columns import ANSWER, PATH
+from experiments.runs.console import pluralize
 from experiments.runs.row import Outcome, write_frame
-from experiments.sweeps.summary import BELOW, COUNT_WORDS, COUNTS, MARKS
+from experiments.sweeps.summary import BELOW, COUNT_WORDS, COUNTS, ERROR, MARKS, summary
+from experiments.sweeps.winner import find_winner
 from sim.errors import require
 from sim.files import write_text
 
@@ -140,3 +143,40 @@ def statuses(table: pd.DataFrame) -> list[tuple[str, int]]:
     rest = counts[_MOST_REMARKS:].sum()
     found = list(counts[:_MOST_REMARKS].items())
     return [*found, ("ended in other ways", int(rest))] if rest else found
+
+
+def write_rows(rows: pd.DataFrame, out: Path) -> str:
+    """Write every row, with all its columns; say how many."""
+    write_frame(rows, out)
+    return f"{out}: {pluralize(len(rows), 'row')}, {len(rows.columns)} columns"
+
+
+_NARROW = (ERROR, f"{ANSWER}nees_mean")
+
+
+def table_of(
+    rows: pd.DataFrame,
+    name: str,
+    out: Path | None,
+    against: str | None,
+    metrics: Sequence[str],
+    size: str | None,
+    *,
+    efficiency: bool = False,
+) -> str:
+    """Mean errors of a sweep as lines, or in a file; then it says how many rows that has."""
+    narrow = size == "column" and not metrics  # one table as wide as a column
+    if narrow:  # with `against`, the ratio of the errors takes the place of the NEES
+        metrics = [m for m in _NARROW[: 1 if against else 2] if m.removeprefix(ANSWER) in rows]
+    found = summary(rows, against, metrics, efficiency=efficiency)
+    found = found.assign(with_remarks=0) if narrow else found
+    note = notes(found, against)
+    if out is not None:
+        write_table(found, note, out, Path(name).name, size)
+        return f"{out}: {pluralize(len(found), 'row')}"
+    lines = as_lines(found, note)
+    if not metrics and (winner := find_winner(rows)):
+        lines += "\n\n" + "\n".join(winner.sentences())
+    if (rows["status"] != Outcome.OK).any():
+        lines += "\n\n" + "\n".join(f"{count} {words}" for words, count in statuses(rows))
+    return lines

@@ -449,8 +449,8 @@ def check_overrides(overrides: Sequence[str]) -> None:
     """
     for text in overrides:
         key = text.lstrip("+~").partition("=")[0]
-        known = f"a file? recording={text} takes it" if Path(text).suffix else f"such as {key}=1"
-        require("=" in text or text[:1] == "~", f"{text}: write KEY=VALUE; {known}")
+        known = f"; a file? recording={text} takes it" if Path(text).suffix else f", as {key}=1"
+        require("=" in text or text[:1] == "~", f"{text}: write KEY=VALUE{known}")
         remedy = next(said for start, said in _REMEDIES.items() if key.startswith(start))
         require(
             re.match(r"hydra\b", key) is None or key.startswith(_READ_OF_HYDRA),

@@ -388,8 +388,8 @@ def _true_start(recording: Recording) -> Array:
     require(
         bool(np.isfinite(start).all()),
         f"the first Frame is at {begin_s:.2f} s, and the truth spans {spans[0]:.2f} to "
-        f"{spans[1]:.2f} s: no start pose is known; cut the log by `estima convert --from "
-        f"{math.ceil(max(float(spans[0]) - begin_s, 0.0) * 100) / 100:.2f}`, or set "
+        f"{spans[1]:.2f} s: no start pose is known; have `estima convert` cut the log from "
+        f"{math.ceil(max(float(spans[0]) - begin_s, 0.0) * 100) / 100:.2f} s on, or set "
         "prior.start=global",
     )
     return start

@@ -266,7 +266,9 @@ def describe_option(group: str, name: str, searched: Sequence[str] = ()) -> str:
         If the group or sensor is unknown, or what the option names cannot be found.
     """
     if group in OPTIONS:
-        return "\n".join([group, *_said(OPTIONS[group], {})])
+        with initialize_config_dir(str(CONF), version_base="1.3"):
+            keys: Config = OmegaConf.to_container(compose("config")[group])  # type: ignore[assignment]
+        return "\n".join([group, *_said(OPTIONS[group], keys)])
     require(group in GROUPS, f"no group {group}; there are: {', '.join(GROUPS)}")
     kind = sensor_class(name) if group == "sensors" else None
     if kind is not None:

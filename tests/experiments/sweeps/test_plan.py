@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from experiments.runs.compose import searched
+from experiments.runs.console import RunFailedError
 from experiments.runs.experiment import Experiment
 from experiments.runs.paths import quoted, results
 from experiments.sweeps import launch, plan
@@ -236,3 +237,18 @@ def test_the_number_of_jobs():
     for wrong in (["jobs=0"], ["jobs=many"], ["jobs=1", "jobs=2"]):
         with pytest.raises(InputError, match="one whole number"):
             launch._n_jobs(wrong)
+
+
+def test_workers_that_die_before_a_run_are_started_once_more(tmp_path, monkeypatch):
+    tried = []
+
+    def dies(*_):
+        tried.append(1)
+        return RuntimeError("terminated")
+
+    monkeypatch.setattr(launch, "_launch", dies)
+    every = plan.make_plan([*QUICK, "seed=0,1"])
+    with pytest.raises(RunFailedError, match="died twice before its first run"):
+        launch._launch_all(every, np.arange(2), launch.Jobs(tmp_path, 1), [])
+    assert len(tried) == 2
+    assert not list(tmp_path.glob("plan-*"))

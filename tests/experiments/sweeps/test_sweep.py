@@ -17,7 +17,6 @@ import pandas as pd
 import pytest
 
 from experiments.runs import cache, store
-from experiments.runs.console import RunFailedError
 from experiments.runs.experiment import Experiment
 from experiments.runs.paths import results
 from experiments.runs.processes import hold_interrupts
@@ -160,21 +159,6 @@ def test_workers_end_with_a_killed_sweep(name):
     assert list(folder(name).glob("plan-*"))
     assert estima("run", "-m", *SHORT, f"name={name}", "seed=range(400,402)").returncode == 0
     assert not list(folder(name).glob("plan-*"))
-
-
-def test_workers_that_die_before_a_run_are_started_once_more(tmp_path, monkeypatch):
-    tried = []
-
-    def dies(*_):
-        tried.append(1)
-        return RuntimeError("terminated")
-
-    monkeypatch.setattr(launch, "_launch", dies)
-    every = plan.make_plan([*QUICK, "seed=0,1"])
-    with pytest.raises(RunFailedError, match="died twice before its first run"):
-        launch._launch_all(every, np.arange(2), launch.Jobs(tmp_path, 1), [])
-    assert len(tried) == 2
-    assert not list(tmp_path.glob("plan-*"))
 
 
 @pytest.mark.slow
