@@ -426,10 +426,10 @@ def _check_added(overrides: Sequence[Override], groups: Collection[str]) -> None
 
 
 def _check_stated(cfg: DictConfig, study: str | None) -> None:
-    """Check that a study's keys are read, or are labels of its own, which hold one value."""
+    """Check that a study's keys are read, or its own: labels that hold one value, and objects."""
     known = (*KEYS, *_OF_STUDIES)
     for key, value in cfg.items_ex(resolve=False):
-        one = not isinstance(value, DictConfig | ListConfig)
+        one = not isinstance(value, DictConfig | ListConfig) or "_target_" in value
         require(
             key in known or (one and not get_close_matches(str(key), known, cutoff=0.75)),
             f"study={study}: {describe_unknown(str(key), known)}",

@@ -29,8 +29,11 @@ def test_a_misread_start_is_a_loss_that_odometry_misses(monkeypatch):
     assert "nothing" not in set(losses["planted"])
     curve = figures.curves(table)
     assert curve["missed"].iloc[-1] == 1.0  # without alarms
-    line = figures.draw_alarms(curve).axes[0].get_lines()[0]
-    assert line.get_label() == f"odometry ({len(losses)} losses)"
+    alert = curve.assign(method="alert", missed=0.0)
+    lines = figures.draw_alarms(pd.concat([curve, alert])).axes[0].get_lines()
+    named = [line.get_label() for line in lines]
+    assert f"alert ({len(losses)} losses)" in named
+    assert "odometry" in named  # grey, with all that miss most
 
 
 def test_each_method_has_the_drive_and_the_start_that_are_said(monkeypatch):
