@@ -426,12 +426,14 @@ def _check_added(overrides: Sequence[Override], groups: Collection[str]) -> None
 
 
 def _check_stated(cfg: DictConfig, study: str | None) -> None:
-    """Check that a study's keys are read, or its own: labels that hold one value, and objects."""
+    """Check that a study's keys are read, or its own: labels, and what other keys follow."""
     known = (*KEYS, *_OF_STUDIES)
     for key, value in cfg.items_ex(resolve=False):
-        one = not isinstance(value, DictConfig | ListConfig) or "_target_" in value
+        is_label = not isinstance(value, DictConfig | ListConfig)
+        if key in known or (is_label and not get_close_matches(str(key), known, cutoff=0.75)):
+            continue
         require(
-            key in known or (one and not get_close_matches(str(key), known, cutoff=0.75)),
+            re.search(rf"\$\{{{key}\b", OmegaConf.to_yaml(cfg)),
             f"study={study}: {describe_unknown(str(key), known)}",
         )
 
