@@ -6,7 +6,7 @@ import functools
 import re
 import sys
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
@@ -35,7 +35,7 @@ from experiments.runs.schema import (
     value_at,
 )
 from experiments.runs.targets import named_code
-from sim.errors import InputError, describe_unknown, require
+from sim.errors import InputError, describe_unknown, naming, require
 from sim.files import read_text, sha256_of, write_text
 from sim.yaml_file import read_yaml
 
@@ -154,7 +154,10 @@ class Composer:
         _check_calibrated(each)
         cfg = base.cfg.copy()
         for override in plain:
-            set_value(cfg, override.key_or_group, override.value())
+            key = override.key_or_group
+            chosen = base.choices.get(key.partition(".")[0])
+            with naming(f"estimator={chosen}") if key.startswith("estimator.") else nullcontext():
+                set_value(cfg, key, override.value())
         self._check(cfg)
         if any(isinstance(o.value(), dict) for o in plain):
             fill(cfg)
@@ -433,7 +436,7 @@ def _check_stated(cfg: DictConfig, study: str | None) -> None:
         if key in known or (is_label and not get_close_matches(str(key), known, cutoff=0.75)):
             continue
         require(
-            re.search(rf"\$\{{{key}\b", OmegaConf.to_yaml(cfg)),
+            re.search(rf"\$\{{{key!s}\b", OmegaConf.to_yaml(cfg)),
             f"study={study}: {describe_unknown(str(key), known)}",
         )
 
