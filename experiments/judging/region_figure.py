@@ -65,7 +65,7 @@ def draw_region(
     _draw_line(axes[1], fitted, critical, place, of[0], printed[critical])
     n, others = len(quantities), "the middle" if anchor is None else "the anchor"
     axes[0].set_title(f"Where it holds\n(other settings at {others})", fontsize="medium")
-    what = f"The critical of its {n} ratios" if n > 1 else "Its ratio"
+    what = f"The most critical of its {n} ratios" if n > 1 else "Its ratio"
     axes[1].set_title(f"{what}\n(other settings at {others})", fontsize="medium")
     axes[1].set_ylabel(literal(quantities[critical]))
     for row, i in enumerate(reversed(order)):
@@ -87,7 +87,7 @@ def _over_two(fitted: Fitted, place: Array, of: tuple[int, int]) -> tuple[Array,
 
 
 def _draw_map(ax: Axes, fitted: Fitted, place: Array, of: tuple[int, int]) -> None:
-    """Draw where the claim holds over two settings, where it does not, and where none is sure."""
+    """Draw where the claim holds over two settings, where it does not, and where neither is sure."""
     across, up, units = _over_two(fitted, place, of)
     margins = fitted.margins(units).reshape(-1, *across.shape)
     sure = (margins[1:] > 0.0).mean(axis=0)
