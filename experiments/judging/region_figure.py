@@ -87,7 +87,7 @@ def _over_two(fitted: Fitted, place: Array, of: tuple[int, int]) -> tuple[Array,
 
 
 def _draw_map(ax: Axes, fitted: Fitted, place: Array, of: tuple[int, int]) -> None:
-    """Draw where the claim holds over two settings, where it does not, and where neither is sure."""
+    """Draw where the claim holds over two settings, where it fails, and where neither is sure."""
     across, up, units = _over_two(fitted, place, of)
     margins = fitted.margins(units).reshape(-1, *across.shape)
     sure = (margins[1:] > 0.0).mean(axis=0)
