@@ -318,13 +318,13 @@ def sweep(*overrides: str, name: str | None = None) -> pd.DataFrame:
     from experiments.sweeps.collect import collect
 
     own = f"sweep_{hashlib.sha256(repr(overrides).encode()).hexdigest()[:8]}"
-    named = [str(line).partition("=")[2] for line in overrides if str(line).startswith("name=")]
-    folder = name or (named or [own])[-1]
-    try:
-        with _checked(overrides):
+    with _checked(overrides):
+        named = [line.partition("=")[2] for line in overrides if line.startswith("name=")]
+        folder = name or (named or [own])[-1]
+        try:
             launch.sweep([*overrides, f"name={folder}"])
-    except RunFailedError as error:
-        warnings.warn(str(error), stacklevel=2)
+        except RunFailedError as error:
+            warnings.warn(str(error), stacklevel=2)
     return collect(folder)
 
 

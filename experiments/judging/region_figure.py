@@ -174,8 +174,8 @@ def _round_values(
     else:
         ticks = MaxNLocator(_N_TICKS - 1, integer=is_integer).tick_values(low, high)
         tried = [np.asarray(ticks, float)]
-    beyond = 1e-9 * abs(high)
-    inside = [v[(v >= low - min(beyond, 1e-9 * abs(low))) & (v <= high + beyond)] for v in tried]
+    beyond = 1e-9 * (high - low)  # rounding
+    inside = [v[(v >= low - beyond) & (v <= high + beyond)] for v in tried]
     return list(next((v for v in inside if len(v) <= _N_TICKS), inside[-1]).tolist())
 
 
