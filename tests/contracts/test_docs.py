@@ -144,7 +144,8 @@ def test_it_documents_the_api(site):
 
 @pytest.mark.slow
 def test_its_examples_are_the_scripts(site):
-    pages = [ROOT / "docs" / name for name in ("examples/index.md", "programs.md", "regression.md")]
+    names = ("examples/index.md", "guide.md", "programs.md", "regression.md")
+    pages = [ROOT / "docs" / name for name in names]
     shown = [name for page in pages for name in re.findall(r'--8<-- "(.*?)"', page.read_text())]
     assert sorted(shown) == sorted(
         str(path.relative_to(ROOT))
