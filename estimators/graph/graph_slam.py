@@ -53,6 +53,7 @@ from estimators.laser.scan_matching import (
     MatcherOptions,
     ScanMatcher,
 )
+from estimators.lost import Unexplained
 from estimators.wheels import EncoderTickOptions, WheelPrediction
 from sim import se2
 from sim.arrays import Array, Ints
@@ -115,8 +116,8 @@ class GraphSlam(GraphSlamOptions):
 
     `graph` holds the key frames and closures so far.
 
-    Belief extras: `registration_status`, `status` if a scan was not used, `closures`, the number
-    believed so far.
+    Belief extras: `registration_status`, `status` if a scan was not used, `lost`, `closures`, the
+    number believed so far.
     """
 
     needs = frozenset({"laser"})
@@ -137,6 +138,7 @@ class GraphSlam(GraphSlamOptions):
         self._in_key = self._by_wheels = STILL  # base_link in the newest node's frame
         self._last_tie: Gaussian | None = None  # of the newest key frame to the one before
         self._failures = self._denials = 0
+        self._unexplained = Unexplained()
         self._searched_m = self._checked_m = 0.0
         self._path: list[_Placed] = []
         self._stamps, self._now = [math.nan], math.nan
@@ -162,9 +164,12 @@ class GraphSlam(GraphSlamOptions):
             extras["registration_status"] = status
             if status not in ("first", "ok", "degenerate"):
                 extras["status"] = status
+            self._unexplained.note(frame.stamp, "status" in extras)
         extras["closures"] = len(self.graph.closures)
         self._path.append(_Placed(frame.stamp, len(self.graph) - 1, self._in_key))
         belief = _symmetric(self.graph.newest.then(self._in_key))
+        if reading is not None:
+            extras["lost"] = self._unexplained.lost(belief.covariance)
         return Belief(belief.mean, belief.covariance, extras)
 
     def finish(self) -> Estimate:

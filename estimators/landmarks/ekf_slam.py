@@ -26,6 +26,7 @@ from estimators.landmarks.sightings import (
 )
 from estimators.landmarks.slam_frontend import Image, LandmarkSlamOptions, SlamFrontEnd
 from estimators.landmarks.stereo import MIN_DEPTH_M
+from estimators.lost import Unexplained
 from estimators.wheels import NO_MOTION, GainOptions, gained_motion
 from sim.arrays import Array, Ints
 from sim.errors import require
@@ -81,7 +82,7 @@ class EkfSlam(EkfSlamOptions, TeamEstimator):
     that started its landmark, itself if it is the first, -1 if it was rejected, -2 if its landmark
     has just counted (`repeat_s`); with `keep_map` also `landmarks` (N, 3) and
     `landmark_covariances` (N, 3, 3); `wheel_gains` (3,), g_r, g_l and g_b, where they are states;
-    `status` when an image was not used.
+    `status` when an image was not used; with each image `lost`, from 0 to 1, by known ids.
 
     A step costs O(K N^2): the whole covariance is touched. So the map holds at most 4000 landmarks;
     `status` says when it is full, and when an image has more than 1000 observations.
@@ -120,6 +121,7 @@ class EkfSlam(EkfSlamOptions, TeamEstimator):
                 mean[_own(robot)], P[_own(robot), _own(robot)] = start.mean, start.covariance
         self._state = JointGaussian(mean, P, first + 3 * _MOST_LANDMARKS)
         self._motions = [STILL] * n  # since the last image
+        self._unexplained = [Unexplained() for _ in range(n)]
         after = 0 if self.gate_probability is None else self.doubt_sightings
         self._doubts = [Doubt(after) for _ in range(n)]
         self._placed_by = np.zeros(0, np.int64)  # robot that has added each landmark
@@ -130,6 +132,7 @@ class EkfSlam(EkfSlamOptions, TeamEstimator):
 
         That of a robot whose place in the map is not known yet is NaN.
         """
+        self._now_s = frames[0].stamp
         for frame in frames:
             self._roll(frame)
         extras: list[dict[str, Any]] = [{} for _ in frames]
@@ -169,6 +172,8 @@ class EkfSlam(EkfSlamOptions, TeamEstimator):
             extras["wheel_gains"] = self._state.mean[self._gains].copy()
         else:
             pose = pose.then(self._motions[frame.robot])
+        if "associations" in extras and self.front_end.identified:
+            extras["lost"] = self._unexplained[frame.robot].lost(pose.covariance)
         if self.keep_map:
             extras |= {k: v for k, v in self.map.items() if k.startswith("landmark")}
         return Belief(pose.mean.copy(), (pose.covariance + pose.covariance.T) / 2.0, extras)
@@ -279,6 +284,7 @@ class EkfSlam(EkfSlamOptions, TeamEstimator):
         if known.any():
             in_base = self._camera.place(np.zeros(3), image.points[known])[..., :2]
             doubt.note(old, in_base, passed[known])
+        self._unexplained[robot].note(self._now_s, *2 * (int((~passed[known]).sum()),))
         if passed[known].any():
             self._n_trusted[robot] = self._n_landmarks
         return passed & (known | (not doubt.rises))
@@ -340,6 +346,9 @@ class EkfSlam(EkfSlamOptions, TeamEstimator):
         S += by_other
         for k in range(len(at)):
             S[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] += R[k]
+        own_S = S.reshape(len(at), 3, len(at), 3)[every := np.arange(len(at)), :, every]
+        far = mahalanobis_squared(v, own_S) > self.d0
+        self._unexplained[own.start // 3].note(self._now_s, int(far.sum()), len(at))
         correction = self._state.update(HP, S, v)
         if correction is not None:
             self._correct(correction)

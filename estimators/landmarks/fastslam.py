@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from estimators.base import Belief, Estimate, Prior, TeamEstimator
@@ -16,6 +15,7 @@ from estimators.landmarks.particle_maps import LandmarkMaps, Maps
 from estimators.landmarks.particle_path import ParticlePath, packed_mount
 from estimators.landmarks.sightings import Sightings, dead_reckoning, team_starts
 from estimators.landmarks.slam_frontend import Image, LandmarkSlamOptions, SlamFrontEnd
+from estimators.lost import Unexplained
 from estimators.particles import Scheme, have_underflowed, keep_survivors, normalize, resample
 from sim.arrays import Array, Ints
 from sim.errors import required
@@ -80,7 +80,7 @@ class FastSLAM(FastSlamOptions, TeamEstimator):
     eq. (20); at an image `associations` (K,) of that particle: for each observation, counted from
     0 over the whole run, the one that started its landmark, itself if it is the first, -1 if it
     was rejected; with `keep_map` also `landmarks` (N, 3) and `landmark_covariances` (N, 3, 3);
-    `status` when an image was not used.
+    `status` when an image was not used; with each image `lost`, from 0 to 1, by known ids.
 
     `finish` gives the path of the best particle's lineage; `map` is its map.
     """
@@ -105,6 +105,7 @@ class FastSLAM(FastSlamOptions, TeamEstimator):
         self._maps = LandmarkMaps(n, self.maps, births=not self.front_end.identified)
         mount, n_blocks = self.front_end.camera.mount, self._maps.n_blocks
         self._paths = []
+        self._unexplained = [Unexplained() for _ in priors]
         for start, wheels in zip(starts, dead_reckoning(self, priors), strict=True):
             start = required(start, "fastslam needs the starts of all robots; ekf_slam does not")
             path = ParticlePath(wheels, self.slip_dof, mount, n, n_blocks)
@@ -150,6 +151,8 @@ class FastSLAM(FastSlamOptions, TeamEstimator):
             "ess": self._ess,
             "best": compose(path.drawn[self._best], path.rolled.mean)[0],
         }
+        if "associations" in extras and self.front_end.identified:
+            extras["lost"] = self._unexplained[frame.robot].lost(belief.covariance)
         if self.keep_map:
             extras |= {k: v for k, v in self.map.items() if k.startswith("landmark")}
         path.note(frame.stamp)
@@ -165,8 +168,11 @@ class FastSLAM(FastSlamOptions, TeamEstimator):
         known = self.front_end.identified
         if known:
             slots = self.front_end.known(image)
+            distances, pose = self._distances(path, image, slots)
+            far = int((distances > self.d0).sum())
+            self._unexplained[frame.robot].note(frame.stamp, far, len(distances))
             if self.gate_probability is not None and len(slots):
-                passed = self._passed(path, image, slots)
+                passed = self.front_end.passed(image, slots, distances, pose)
                 image, slots, points = image.select(passed), slots[passed], points[passed]
             self._maps.touch(slots[slots >= 0])
         self.front_end.note_counted(image, frame)
@@ -278,8 +284,8 @@ class FastSLAM(FastSlamOptions, TeamEstimator):
             self._camera,
         )
 
-    def _passed(self, path: ParticlePath, image: Image, slots: Ints) -> NDArray[np.bool_]:
-        """Which observations (K,) of landmarks in these slots pass the best particle's gate."""
+    def _distances(self, path: ParticlePath, image: Image, slots: Ints) -> tuple[Array, Array]:
+        """Squared distances of known landmarks by the best particle, and its pose."""
         camera, old = self.front_end.camera, slots >= 0
         moved = Gaussian(path.drawn[self._best], np.zeros((3, 3))).then(path.rolled)
         means, covariances, _ = self._maps.of_particle(self._best)
@@ -288,7 +294,7 @@ class FastSLAM(FastSlamOptions, TeamEstimator):
         turned = of_landmark.transpose(0, 2, 1)
         S = of_pose @ moved.covariance @ of_pose.transpose(0, 2, 1) + R
         S += of_landmark @ covariances[slots[old]] @ turned
-        return self.front_end.passed(image, slots, mahalanobis_squared(v, S), moved.mean)
+        return mahalanobis_squared(v, S), moved.mean
 
     def _propose(self, path: ParticlePath, normals: Array, slots: Ints, points: Array) -> Array:
         """Turn normals into draws given the image; their log importance weights (M,).

@@ -28,6 +28,7 @@ from estimators.laser.scan_matching import (
     exceeds,
 )
 from estimators.laser.sweep import skew_covariance
+from estimators.lost import Unexplained
 from estimators.wheels import EncoderTickOptions, WheelPrediction
 from sim import se2
 from sim.arrays import Array
@@ -106,7 +107,7 @@ class EkfIcp(EkfIcpOptions):
 
     Belief extras: `registration_covariance` (3, 3) of T_reference_base, `registration_status`,
     `nis` (normalised innovation squared) with `nis_dof`, `slip_burst` if one was assumed, and
-    `status` if a scan was not used.
+    `status` if a scan was not used; `lost`, from 0 to 1.
     """
 
     needs = frozenset({"laser"})
@@ -138,6 +139,7 @@ class EkfIcp(EkfIcpOptions):
         # a scan whose pose in the key frame was registered, and the key frame's pose in it
         self._witness: tuple[PreparedScan, Gaussian] | None = None
         self._slip_m2 = 0.0  # variance of a wheel's slip from scan to scan besides kr and kl
+        self._unexplained = Unexplained()
         share = self.gate_probability
         self._gates = [math.inf if share is None else chdtri(d, share) for d in range(4)]
 
@@ -149,10 +151,13 @@ class EkfIcp(EkfIcpOptions):
         if scan is not None and self._is_due():
             prepared = self.matcher.prepare(scan["ranges_m"], self._laser, moved, frame.duration_s)
             self._correct(prepared, extras)
+            self._unexplained.note(frame.stamp, "status" in extras)
         by_twist, by_bias = _from_twist(self._mean[_POSE]), self._by_bias[_POSE]
         covariance = self._covariance[_POSE, _POSE] + by_bias @ self._biases_m2 @ by_bias.T
         covariance = by_twist @ covariance @ by_twist.T
         mean = self._mean[_POSE] + self._origin
+        if scan is not None:
+            extras["lost"] = self._unexplained.lost(covariance)
         return Belief(mean, (covariance + covariance.T) / 2.0, extras)
 
     def _predict(self, frame: Frame) -> Array:

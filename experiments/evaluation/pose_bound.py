@@ -35,7 +35,7 @@ class Sights(NamedTuple):
     landmarks
         (K,) number of its landmark; they are numbered as they first appear.
     cross
-        (K, 3, 3) information between the pose and the landmark, A^T R^-1 B.
+        (K, n, 3) information between the pose and the landmark, A^T R^-1 B.
     own
         (K, 3, 3) information about the landmark, B^T R^-1 B.
     """
@@ -49,16 +49,18 @@ class Sights(NamedTuple):
 class Chain(NamedTuple):
     """A path and what is measured along it, linearised at the truth; poses are m, m, rad in map.
 
+    Of R robots that know of each other, a pose is those of all, one after the other: n = 3 R.
+
     Attributes
     ----------
     start
-        (3, 3) covariance of the first pose before its measurements.
+        (n, n) covariance of the first pose before its measurements.
     by_before
-        (T, 3, 3) derivative of each pose by the one before; the first is not read.
+        (T, n, n) derivative of each pose by the one before; the first is not read.
     noise
-        (T, 3, 3) covariance of the motion to each pose; the first is not read.
+        (T, n, n) covariance of the motion to each pose; the first is not read.
     information
-        (T, 3, 3) of the measurements at each pose about it, landmarks given.
+        (T, n, n) of the measurements at each pose about it, landmarks given.
     sights
         Those of unknown landmarks, or None.
     """
@@ -71,7 +73,7 @@ class Chain(NamedTuple):
 
 
 class PathBound(NamedTuple):
-    """Least covariances (T, 3, 3) of each pose: given the past, and given the whole recording."""
+    """Least covariances (T, n, n) of each pose: given the past, and given the whole recording."""
 
     online: Array
     revised: Array
@@ -141,9 +143,9 @@ def bound_dead_reckoning(
 
 
 def _filter(chain: Chain) -> tuple[Array, Array]:
-    """Covariances (T, 3, 3) of each pose before its measurements and after, landmarks given."""
+    """Covariances (T, n, n) of each pose before its measurements and after, landmarks given."""
     predicted, updated = np.empty_like(chain.noise), np.empty_like(chain.noise)
-    identity, P = np.eye(3), chain.start
+    identity, P = np.eye(len(chain.start)), chain.start
     for k, (F, Q, information) in enumerate(
         zip(chain.by_before, chain.noise, chain.information, strict=True)
     ):
@@ -160,12 +162,12 @@ def _with_landmarks(chain: Chain, sights: Sights, given: PathBound, gains: Array
     """The bounds, from those given the landmarks and the gains of smoothing."""
     # Only Frames that measure something are kept (m of them); the others are reached from those.
     seeing = np.union1d(sights.rows, np.flatnonzero(chain.information.any(axis=(1, 2))))
-    m, n_landmarks = len(seeing), int(sights.landmarks.max()) + 1
+    m, n, n_landmarks = len(seeing), len(chain.start), int(sights.landmarks.max()) + 1
     last = np.searchsorted(seeing, np.arange(len(chain.noise)), side="right")  # 0: none yet
     into, onward, back = _between(chain.by_before, gains, seeing)
     own_rows = np.searchsorted(seeing, sights.rows)
-    V, U = np.zeros((m, 3, n_landmarks, 3)), np.zeros((m, 3, 3 * n_landmarks))
-    V[own_rows, :, sights.landmarks] = sights.cross
+    V, U = np.zeros((m, n, n_landmarks, 3)), np.zeros((m, n, 3 * n_landmarks))
+    np.add.at(V.transpose(0, 2, 1, 3), (own_rows, sights.landmarks), sights.cross)
     V = V.reshape(U.shape)
     information, updated = chain.information[seeing], given.online[seeing]
     for j in range(m):
@@ -173,7 +175,7 @@ def _with_landmarks(chain: Chain, sights: Sights, given: PathBound, gains: Array
             U[j] = into[j] @ U[j - 1]
         V[j] += information[j] @ U[j]
         U[j] -= updated[j] @ V[j]
-    S, spread = np.zeros((U.shape[2],) * 2), np.zeros((m + 1, 3, 3))
+    S, spread = np.zeros((U.shape[2],) * 2), np.zeros((m + 1, n, n))
     for group in np.array_split(np.arange(m), min(m, _GROUPS)):
         rows = slice(group[0], group[-1] + 1)
         seen = slice(*np.searchsorted(own_rows, [rows.start, rows.stop]))
@@ -189,11 +191,11 @@ def _with_landmarks(chain: Chain, sights: Sights, given: PathBound, gains: Array
     for j in range(m - 2, -1, -1):
         smoothed[j] += back[seeing[j]] @ (smoothed[j + 1] - into[j + 1] @ U[j])
     # A Frame between two that are kept: filtered at the one before, smoothed at the one after
-    none = np.zeros((1, 3, U.shape[2]))
+    none = np.zeros((1, n, U.shape[2]))
     ends = np.hstack(
         [_solve_root(S, np.vstack([none, U])), _solve_root(S, np.vstack([smoothed, none]))]
     )
-    by_next = np.vstack([into, np.zeros((1, 3, 3))])[last]
+    by_next = np.vstack([into, np.zeros((1, n, n))])[last]
     by_ends = np.concatenate([onward - back @ by_next, back], axis=2)
     joint = (ends @ ends.transpose(0, 2, 1))[last]
     return PathBound(online, given.revised + by_ends @ joint @ by_ends.transpose(0, 2, 1))
@@ -205,17 +207,17 @@ def _between(by_before: Array, gains: Array, seeing: Ints) -> tuple[Array, Array
     Returns
     -------
     tuple of Array
-        Derivative (m, 3, 3) of each kept pose by the one kept before; that of every pose (T, 3, 3)
-        by the last kept one; and its gain (T, 3, 3) of smoothing from the next kept one.
+        Derivative (m, n, n) of each kept pose by the one kept before; that of every pose (T, n, n)
+        by the last kept one; and its gain (T, n, n) of smoothing from the next kept one.
     """
     kept = np.isin(np.arange(len(by_before)), seeing)
     into, onward, back = [], np.empty_like(by_before), gains.copy()
-    reached = np.eye(3)
+    reached = identity = np.eye(by_before.shape[1])
     for k, F in enumerate(by_before):
         reached = F @ reached if k else reached
         if kept[k]:
             into.append(reached)
-            reached = np.eye(3)
+            reached = identity
         onward[k] = reached
     for k in range(len(gains) - 2, -1, -1):
         if not kept[k + 1]:
@@ -227,16 +229,16 @@ def _add_information(S: Array, information: Array, updated: Array, U: Array, V: 
     """Add to S (n, n) what Frames tell of the landmarks, but for their own information."""
     # With the residual's derivative B + A U~ by the landmarks, U~ before the update, it is
     # (B + A U~)^T (R + A P~ A^T)^-1 (B + A U~); V is A^T R^-1 (B + A U~), so U~ = U + P V.
-    n, gain = len(S), updated @ V
+    flat, gain = (-1, len(S)), updated @ V
     before = U + gain
     outer = 2.0 * V - information @ before
-    whole = before.reshape(-1, n).T @ outer.reshape(-1, n)
-    whole -= V.reshape(-1, n).T @ gain.reshape(-1, n)
+    whole = before.reshape(flat).T @ outer.reshape(flat)
+    whole -= V.reshape(flat).T @ gain.reshape(flat)
     S += (whole + whole.T) / 2.0
 
 
 def _solve_root(S: Array, U: Array) -> Array:
-    """U L^-T (m, 3, n) of U (m, 3, n), where S = L L^T."""
+    """U L^-T (m, n, s) of U (m, n, s), where S = L L^T."""
     root = scipy.linalg.cholesky(S, lower=True, check_finite=False)
     flat = np.ascontiguousarray(U.reshape(-1, len(S))).T
     half = scipy.linalg.solve_triangular(root, flat, lower=True, check_finite=False)

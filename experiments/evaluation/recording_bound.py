@@ -11,7 +11,7 @@ landmarks are *not* seen, or which beams return nothing, tells nothing.
 """
 
 import functools
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -36,7 +36,8 @@ from sim.recording import Recording
 from sim.robot.arc import arc_increment, arc_increment_jacobian
 from sim.robot.base import robot_from_config
 from sim.robot.drive import DifferentialDrive
-from sim.sensors import Encoder, Laser, Sensor, StereoCamera
+from sim.sensors import Encoder, Laser, RobotCamera, Sensor, StereoCamera
+from sim.team import Team
 from sim.worlds.world import World
 
 _BENT_RAD2 = 0.3**2  # variance of a heading from which on sensors are not linearised
@@ -44,38 +45,51 @@ _BENT_RAD2 = 0.3**2  # variance of a heading from which on sensors are not linea
 
 @dataclass(frozen=True)
 class _Known:
-    """What the bound depends on; the recording by its checksum."""
+    """What the bound depends on; the recordings by their checksum."""
 
     checksum: str
     sensors: tuple[str, ...]
-    start: bytes
+    starts: tuple[bytes, ...]
     landmarks: bool
-    recording: Recording = field(compare=False, repr=False)
+    team: Team = field(compare=False, repr=False)
 
 
 def bound_recording(recording: Recording, prior: Prior, names: Iterable[str]) -> PathBound | None:
-    """Bound at each Frame of a recording; it is made once for several runs.
+    """Bound at each Frame of a recording, as `bound_team` has it."""
+    bounds = bound_team(Team((recording,)), [prior], names)
+    return None if bounds is None else bounds[0]
 
-    None where there is no bound: over a recording that was not simulated, without a start, of a
-    robot or a sensor of another law, with a laser but without a map, where rounding loses what
-    is known of a landmark, and where a heading is off by more than the linearised problem allows.
+
+def bound_team(team: Team, priors: Sequence[Prior], names: Iterable[str]) -> list[PathBound] | None:
+    """Bound at each Frame of each robot, as if all told each other all at once.
+
+    It is made once for several runs. None where there is no bound: over a recording that was not
+    simulated, without a start, of a robot or a sensor of another law, with a laser but without a
+    map, where rounding loses what is known of a landmark, and where a heading is off by more than
+    the linearised problem allows.
 
     Parameters
     ----------
     names
         Sensors that are read.
     """
-    read = tuple(name for name in names if not isinstance(recording.sensors.get(name), Encoder))
-    sensors = [recording.sensors.get(name) for name in read]
-    blind = any(isinstance(sensor, Laser) for sensor in sensors) and prior.map is None
-    if blind or prior.covariance is None or not _is_known(recording, sensors):
+    first, starts = team.robots[0], [prior.covariance for prior in priors]
+    read = tuple(name for name in names if not isinstance(first.sensors.get(name), Encoder))
+    blind = any(isinstance(first.sensors.get(name), Laser) for name in read)
+    if blind and any(prior.map is None for prior in priors):
         return None
-    start, landmarks = prior.covariance.tobytes(), isinstance(prior.map, World)
-    bound = _bound(_Known(recording.checksum, read, start, landmarks, recording))
-    if bound is None or not np.isfinite(bound.online).all():
+    if not all(_is_known(one, [one.sensors.get(name) for name in read]) for one in team.robots):
         return None
-    straight = not read or max(prior.covariance[2, 2], bound.online[:, 2, 2].max()) < _BENT_RAD2
-    return bound if straight else None
+    begun = tuple(start.tobytes() for start in starts if start is not None)
+    mapped = all(isinstance(prior.map, World) for prior in priors)
+    if len(begun) < len(team):
+        return None
+    bounds = _bound(_Known(team.checksum, read, begun, mapped, team))
+    if bounds is None or not all(np.isfinite(bound.online).all() for bound in bounds):
+        return None
+    headings = [bound.online[:, 2, 2].max() for bound in bounds]
+    headings += [start[2, 2] for start in starts if start is not None]
+    return bounds if not read or max(headings) < _BENT_RAD2 else None
 
 
 def bound_scores(covariances: Array) -> dict[str, float]:
@@ -99,7 +113,7 @@ def _is_known(recording: Recording, sensors: list[Sensor | None]) -> bool:
     return all(
         (type(sensor) is Laser and sensor.sigma_range_m > 0.0 and sensor.sweep_s == 0.0)
         or (
-            isinstance(sensor, StereoCamera)
+            isinstance(sensor, StereoCamera | RobotCamera)
             and min(sensor.sigma_column_px, sensor.sigma_row_px, sensor.sigma_disparity_px) > 0.0
         )
         for sensor in sensors
@@ -107,39 +121,114 @@ def _is_known(recording: Recording, sensors: list[Sensor | None]) -> bool:
 
 
 @functools.lru_cache(maxsize=4)
-def _bound(known: _Known) -> PathBound | None:
-    """The bound over all Frames of a recording; None where rounding has spoilt it."""
-    recording, start = known.recording, np.frombuffer(known.start).reshape(3, 3)
-    travel_m, wheels = _travel_and_slip(recording)
+def _bound(known: _Known) -> list[PathBound] | None:
+    """The bound over all Frames of each robot; None where rounding has spoilt it."""
+    robots, starts = known.team.robots, [np.frombuffer(s).reshape(3, 3) for s in known.starts]
+    driven = [_travel_and_slip(robot) for robot in robots]
     if not known.sensors:
-        steps, by_wheels = (
-            arc_increment(travel_m, wheels.track_m),
-            arc_increment_jacobian(travel_m, wheels.track_m),
-        )
-        alone = bound_dead_reckoning(start, steps, by_wheels, wheels.covariances(travel_m))
-        return PathBound(alone, alone)
-    poses = recording.truth_at(recording.frame_stamps)
-    by_before, noise = motion_terms(poses, travel_m, wheels)
-    chain = Chain(start, by_before, noise, np.zeros_like(noise))
-    for name in known.sensors:
-        sensor, log = recording.sensors[name], recording.logs[name]
-        rows = np.searchsorted(recording.frame_stamps, log.stamps)
-        if isinstance(sensor, Laser):
-            told = laser_information(recording.known_world, sensor, poses[rows], log["ranges_m"])
-            np.add.at(chain.information, rows, told)
-        elif isinstance(sensor, StereoCamera):
-            seen = np.asarray(recording.known_truth.readings[name]["true_ids"], np.int64)
-            frames = np.repeat(rows, np.diff(log.known_splits))
-            points = recording.known_world.landmarks[seen]
-            of_pose, cross, own = stereo_information(sensor, poses[frames], points)
-            np.add.at(chain.information, frames, of_pose)
-            if not known.landmarks:
-                sights = Sights(frames, _by_first_sight(seen), cross, own)
-                chain = chain._replace(sights=sights)
+        alone = [
+            bound_dead_reckoning(
+                start,
+                arc_increment(travel_m, wheels.track_m),
+                arc_increment_jacobian(travel_m, wheels.track_m),
+                wheels.covariances(travel_m),
+            )
+            for start, (travel_m, wheels) in zip(starts, driven, strict=True)
+        ]
+        return [PathBound(each, each) for each in alone]
+    instants = np.unique(np.concatenate([robot.frame_stamps for robot in robots]))
+    at = [np.searchsorted(instants, robot.frame_stamps) for robot in robots]
+    n_instants, n = len(instants), 3 * len(robots)
+    chain = Chain(
+        np.zeros((n, n)),
+        np.tile(np.eye(n), (n_instants, 1, 1)),
+        *np.zeros((2, n_instants, n, n)),
+    )
+    poses = np.full((len(robots), n_instants, 3), np.nan)
+    for number, (robot, by) in enumerate(zip(robots, driven, strict=True)):
+        here = at[number][:, None, None], *np.ix_(_own(number), _own(number))
+        chain.start[here[1:]] = starts[number]
+        poses[number, at[number]] = truth = robot.truth_at(robot.frame_stamps)
+        chain.by_before[here], chain.noise[here] = motion_terms(truth, *by)
+    seen = [
+        _inform(chain.information, known, number, name, instants, poses)
+        for number in range(len(robots))
+        for name in known.sensors
+    ]
+    chain = chain._replace(sights=_in_order([own for own in seen if own is not None]))
     try:
-        return bound_path(chain)
+        bound = bound_path(chain)
     except np.linalg.LinAlgError:
         return None
+    of = [(at[number][:, None, None], *np.ix_(*2 * (_own(number),))) for number in range(len(at))]
+    return [PathBound(bound.online[own], bound.revised[own]) for own in of]
+
+
+def _own(robot: int) -> Ints:
+    """Rows of a robot's pose among those of all."""
+    return np.arange(3 * robot, 3 * robot + 3)
+
+
+def _inform(
+    information: Array, known: _Known, number: int, name: str, instants: Array, poses: Array
+) -> Sights | None:
+    """Add what a robot's sensor tells of the poses (T, n, n); the unknown landmarks that it sees.
+
+    Their numbers are the world's.
+
+    Parameters
+    ----------
+    instants
+        (T,) s.
+    poses
+        (R, T, 3) true ones; NaN where a robot has no Frame.
+    """
+    recording = known.team.robots[number]
+    sensor, log = recording.sensors[name], recording.logs[name]
+    frames = np.searchsorted(instants, log.stamps)
+
+    def add(told: Array, first: int, second: int) -> None:
+        rows, columns = _own(first)[:, None], _own(second)
+        np.add.at(information, (frames[:, None, None], rows, columns), told)
+
+    if isinstance(sensor, Laser):
+        world = recording.known_world
+        told = laser_information(world, sensor, poses[number, frames], log["ranges_m"])
+        add(told, number, number)
+        return None
+    seen = np.asarray(recording.known_truth.readings[name]["true_ids"], np.int64)
+    frames = np.repeat(frames, np.diff(log.known_splits))
+    if isinstance(sensor, RobotCamera):
+        every, own_frames = poses[seen, frames], frames
+        for robot in np.unique(seen):
+            of = (seen == robot) & np.isfinite(every[:, 0])
+            frames = own_frames[of]
+            markers = np.column_stack([every[of, :2], np.full(of.sum(), sensor.marker_z_m)])
+            told, cross, other = stereo_information(sensor.camera, poses[number, frames], markers)
+            flat = np.diag([1.0, 1.0, 0.0])  # its height is known, and no heading is seen
+            add(told, number, number)
+            add(cross @ flat, number, robot)
+            add(flat @ cross.transpose(0, 2, 1), robot, number)
+            add(flat @ other @ flat, robot, robot)
+        return None
+    assert isinstance(sensor, StereoCamera)
+    points = recording.known_world.landmarks[seen]
+    told, cross, of_landmark = stereo_information(sensor, poses[number, frames], points)
+    add(told, number, number)
+    if known.landmarks:
+        return None
+    of_all = np.zeros((len(seen), information.shape[1], 3))
+    of_all[:, _own(number)] = cross
+    return Sights(frames, seen, of_all, of_landmark)
+
+
+def _in_order(sights: Sequence[Sights]) -> Sights | None:
+    """Sights of several sensors in the order of their Frames, landmarks numbered as they appear."""
+    if not sights:
+        return None
+    rows, seen, cross, own = (np.concatenate(parts) for parts in zip(*sights, strict=True))
+    order = np.argsort(rows, kind="stable")
+    return Sights(rows[order], _by_first_sight(seen[order]), cross[order], own[order])
 
 
 def _travel_and_slip(recording: Recording) -> tuple[Array, WheelNoise]:

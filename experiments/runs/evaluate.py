@@ -31,7 +31,7 @@ from experiments.evaluation.metrics import (
     score,
     unused_share,
 )
-from experiments.evaluation.recording_bound import bound_recording, bound_scores
+from experiments.evaluation.recording_bound import bound_scores, bound_team
 from experiments.runs.columns import OF_THE_RUN, REVISED, Average, average_of
 from experiments.runs.experiment import Experiment
 from experiments.runs.objects import Objects
@@ -115,11 +115,11 @@ def evaluate(
             paired = [(r, *answer) for r, answer in zip(read.robots, answers, strict=True)]
             statuses = [status_of(*each) for each in paired]
             every = [score_run(*each, **experiment.config["scoring"]) for each in paired]
+            of_all = _bounds(experiment, read, [revised is not None for *_, revised in paired])
+            every = [own | bound for own, bound in zip(every, of_all, strict=True)]
             status, scores = statuses[0], every[0]
             if experiment.team is not None:
                 status, scores = status_of_team(statuses), scores_of_team(read, every)
-            else:
-                scores = scores | _bounds(experiment, *paired[0])
         except InputError:
             raise
         except BaseException as error:
@@ -134,22 +134,24 @@ def evaluate(
     return rows
 
 
-def _bounds(
-    experiment: Experiment, recording: Recording, _: Estimate, revised: Estimate | None
-) -> Row:
-    """Columns of what no method can beat."""
-    settings, read = experiment.config["estimator"], list(recording.sensors)
+def _bounds(experiment: Experiment, read: Team, revised: Sequence[bool]) -> list[Row]:
+    """Columns of what no method can beat, of each robot."""
+    settings, names = experiment.config["estimator"], list(read.robots[0].sensors)
     if is_ours(settings) and "programs" not in settings["_target_"]:  # others may read all
-        read = [name for name in read if name in settings.values()]
+        names = [name for name in names if name in settings.values()]
     with limit_blas():
-        bound = bound_recording(recording, experiment.prior(recording), read)
-    if bound is None:
-        return {}
-    begin_s = recording.frame_stamps[0] + experiment.config["scoring"]["after_s"]
-    counted = recording.frame_stamps >= begin_s
-    row: Row = {**bound_scores(bound.online[counted])}
-    last = bound_scores(bound.revised[counted]) if revised is not None else {}
-    return row | {f"{REVISED}{name}": value for name, value in last.items()}
+        bounds = bound_team(read, experiment.priors(read), names)
+    if bounds is None:
+        return [{} for _ in revised]
+    rows = list[Row]()
+    for robot, bound, is_revised in zip(read.robots, bounds, revised, strict=True):
+        counted = robot.frame_stamps >= (
+            robot.frame_stamps[0] + experiment.config["scoring"]["after_s"]
+        )
+        last = bound_scores(bound.revised[counted]) if is_revised else {}
+        of_path = {f"{REVISED}{name}": value for name, value in last.items()}
+        rows.append({**bound_scores(bound.online[counted]), **of_path})
+    return rows
 
 
 def runner(

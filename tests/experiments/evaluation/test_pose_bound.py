@@ -52,38 +52,63 @@ def random_chain(rng: np.random.Generator, n: int, *, seen: int = 0, every: int 
 
 
 def joint_covariance(chain: Chain, n: int) -> Array:
-    """Covariance (3 n + 3 L, ...) of the first n poses and the landmarks seen: plain inversion."""
-    sights = chain.sights
+    """Covariance (d n + 3 L, ...) of the first n poses and the landmarks seen: plain inversion."""
+    sights, d = chain.sights, len(chain.start)
     used = 0 if sights is None else int(np.searchsorted(sights.rows, n))
     n_seen = 1 + int(sights.landmarks[:used].max()) if sights is not None and used else 0
-    J = np.zeros((3 * n + 3 * n_seen,) * 2)
-    J[:3, :3] = np.linalg.inv(chain.start)
+    J = np.zeros((d * n + 3 * n_seen,) * 2)
+    J[:d, :d] = np.linalg.inv(chain.start)
     for k in range(n):
-        at = slice(3 * k, 3 * k + 3)
+        at = slice(d * k, d * k + d)
         J[at, at] += chain.information[k]
         if k:
-            both = slice(3 * k - 3, 3 * k + 3)
-            E = np.hstack([-chain.by_before[k], np.eye(3)])
+            both = slice(d * k - d, d * k + d)
+            E = np.hstack([-chain.by_before[k], np.eye(d)])
             J[both, both] += E.T @ np.linalg.inv(chain.noise[k]) @ E
     for i in range(used):
         assert sights is not None
-        at = slice(3 * sights.rows[i], 3 * sights.rows[i] + 3)
-        of = slice(3 * (n + sights.landmarks[i]), 3 * (n + sights.landmarks[i]) + 3)
+        at = slice(d * sights.rows[i], d * sights.rows[i] + d)
+        of = slice(d * n + 3 * sights.landmarks[i], d * n + 3 * sights.landmarks[i] + 3)
         J[at, of] += sights.cross[i]
         J[of, at] += sights.cross[i].T
         J[of, of] += sights.own[i]
     return np.asarray(np.linalg.inv(J))
 
 
-@pytest.mark.parametrize(("seen", "every"), [(0, 1), (4, 1), (4, 3)])
+def random_team(rng: np.random.Generator, n: int) -> Chain:
+    """A chain of two robots that see the same landmarks and each other."""
+    both = [random_chain(rng, n, seen=4) for _ in range(2)]
+    blocks = np.zeros((2, n, 6, 6))
+    sights = list[Sights]()
+    for number, own in enumerate(both):
+        at = slice(3 * number, 3 * number + 3)
+        blocks[:, :, at, at] = own.by_before, own.noise
+        assert own.sights is not None
+        cross = np.zeros((len(own.sights.rows), 6, 3))
+        cross[:, at] = own.sights.cross
+        sights.append(own.sights._replace(cross=cross))
+    H = rng.standard_normal((n, 2, 6))  # of each sighting, by both poses
+    parts = [np.concatenate(each) for each in zip(*sights, strict=True)]
+    order = np.argsort(parts[0], kind="stable")
+    seen = Sights(*(part[order] for part in parts))
+    renamed = list(dict.fromkeys(seen.landmarks.tolist()))
+    numbers = np.array([renamed.index(number) for number in seen.landmarks.tolist()])
+    information = H.transpose(0, 2, 1) @ H
+    for row, cross, landmark in zip(seen.rows, seen.cross, seen.own, strict=True):
+        information[row] += cross @ np.linalg.inv(landmark) @ cross.T
+    return Chain(np.eye(6), *blocks, information, seen._replace(landmarks=numbers))
+
+
+@pytest.mark.parametrize(("seen", "every"), [(0, 1), (4, 1), (4, 3), (-1, 1)])
 def test_bound_is_the_inverse_of_the_joint_information(seen: int, every: int) -> None:
-    chain = random_chain(np.random.default_rng(3), 30, seen=seen, every=every)
-    bound = bound_path(chain)
+    rng = np.random.default_rng(3)
+    chain = random_team(rng, 30) if seen < 0 else random_chain(rng, 30, seen=seen, every=every)
+    bound, d = bound_path(chain), len(chain.start)
     for n in (1, 2, 17, 30):
-        last = slice(3 * n - 3, 3 * n)
+        last = slice(d * n - d, d * n)
         wanted = joint_covariance(chain, n)[last, last]
         np.testing.assert_allclose(bound.online[n - 1], wanted, rtol=1e-9, atol=1e-11)
-    whole = joint_covariance(chain, 30)[:90, :90].reshape(30, 3, 30, 3)
+    whole = joint_covariance(chain, 30)[: 30 * d, : 30 * d].reshape(30, d, 30, d)
     np.testing.assert_allclose(bound.revised, whole[range(30), :, range(30)], rtol=1e-9, atol=1e-11)
 
 

@@ -119,6 +119,82 @@ def test_is_the_bound_written_plainly():
     assert (found["bound_rmse_m"], found["bound_heading_rad"]) == pytest.approx(plain, rel=2e-3)
 
 
+TEAM = (
+    "study=teams",
+    "estimator=ekf_slam",
+    "team.size=2",
+    "route.distance_m=4",
+    "seed=0",
+    "prior.map=world",
+)
+
+
+def test_of_a_team_is_the_bound_written_plainly():
+    """A filter over both poses, in which robots see landmarks of the map and each other."""
+    one = Experiment.compose([*TEAM])
+    team = one.recordings()
+    priors = one.priors(team)
+    robots, starts = team.robots, [prior.covariance for prior in priors]
+    config, camera = robots[0].config["robot"], robots[0].sensors["stereo"]
+    clock = np.unique(np.concatenate([robot.frame_stamps for robot in robots]))
+    truth = [robot.truth_at(np.clip(clock, *robot.frame_stamps[[0, -1]])) for robot in robots]
+    rolled = [robot.wheels.at(np.clip(clock, *robot.frame_stamps[[0, -1]])) for robot in robots]
+    world, P = robots[0].truth.world, np.zeros((6, 6))
+    P[:3, :3], P[3:, 3:] = starts
+    R = np.diag([camera.sigma_column_px, camera.sigma_row_px, camera.sigma_disparity_px]) ** 2
+
+    def looked_at(pose, point):
+        x, y, z = points_in_camera(camera, pose, point[None])[0]
+        return camera.focal_px / z * np.array([x, y, camera.baseline_m])
+
+    def marker(pose):
+        return np.array([*pose[:2], robots[0].sensors["robots"].marker_z_m])
+
+    squares, n_met = np.zeros((2, 3, len(clock))), 0
+    for k, stamp in enumerate(clock.tolist()):
+        F, Q = np.eye(6), np.zeros((6, 6))
+        for i in range(2 if k else 0):
+            at, wheels = slice(3 * i, 3 * i + 3), rolled[i][k] - rolled[i][k - 1]
+            before = truth[i][k - 1]
+            G = slope(lambda w: rolled_on(before, w, config["track_m"]), wheels)  # noqa: B023
+            F[3 * i, 3 * i + 2] = -(truth[i][k] - before)[1]
+            F[3 * i + 1, 3 * i + 2] = (truth[i][k] - before)[0]
+            Q[at, at] = G @ np.diag([config["kr"], config["kl"]] * np.abs(wheels)) @ G.T
+        P = F @ P @ F.T + Q
+        both = np.concatenate([own[k] for own in truth])
+        for i, robot in enumerate(robots):
+            for name in ("stereo", "robots"):
+                log = robot.logs[name]
+                rows = np.flatnonzero(log.stamps == stamp)
+                splits, ids = log.splits, robot.truth.readings[name]["true_ids"]
+                for number in [n for row in rows for n in ids[splits[row] : splits[row + 1]]]:
+                    if name == "robots" and stamp > robots[number].frame_stamps[-1]:
+                        continue
+                    n_met += name == "robots"
+
+                    def seen(poses, i=i, name=name, number=number):
+                        other = poses.reshape(2, 3)[number % 2]
+                        point = marker(other) if name == "robots" else world.landmarks[number]
+                        return looked_at(poses.reshape(2, 3)[i], point)
+
+                    H = slope(seen, both)
+                    P = P - P @ H.T @ np.linalg.solve(H @ P @ H.T + R, H @ P)
+        squares[:, :, k] = np.diag(P).reshape(2, 3)
+    assert n_met > 3
+    found = bounds.bound_team(team, priors, ["stereo", "robots"])
+    for i, (robot, bound) in enumerate(zip(robots, found, strict=True)):
+        own = squares[i][:, clock <= robot.frame_stamps[-1]]
+        np.testing.assert_allclose(np.diagonal(bound.online, 0, 1, 2), own.T, rtol=5e-3, atol=1e-9)
+
+
+def test_robots_that_see_each_other_know_more():
+    met, alone = (
+        bound_columns(*TEAM[:-1], f"estimator.robots={robots}") for robots in ("robots", "null")
+    )
+    assert set(met) == set(alone) == COLUMNS
+    assert met["bound_rmse_m"] < alone["bound_rmse_m"]
+
+
 def test_wheels_that_do_not_slip_and_a_start_that_is_known_leave_nothing():
     exact = (*SHORT, "robot.kr=0", "robot.kl=0", "prior.sigma_position_m=0")
     found = bound_columns(*exact, "prior.sigma_heading_rad=0", "estimator=odometry")
