@@ -180,6 +180,8 @@ def _with_landmarks(chain: Chain, sights: Sights, given: PathBound, gains: Array
         rows = slice(group[0], group[-1] + 1)
         seen = slice(*np.searchsorted(own_rows, [rows.start, rows.stop]))
         known = 3 * (int(sights.landmarks[: seen.stop].max(initial=-1)) + 1)
+        if not known:
+            continue  # so far they tell nothing of a landmark
         part, of_known = S[:known, :known], U[rows, :, :known]
         _add_information(part, information[rows], updated[rows], of_known, V[rows, :, :known])
         for landmark, own in zip(sights.landmarks[seen], sights.own[seen], strict=True):

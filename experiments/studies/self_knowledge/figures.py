@@ -13,6 +13,7 @@ from experiments.studies.self_knowledge.planted import LIFTED
 from experiments.viewing.plotting import with_legend
 from experiments.viewing.style import BLACK, CYCLE, WALL, subplots
 
+_FAULTS = {"start": "start misread", "wheels": "wheels lifted"}
 _USEFUL = 0.5  # share of losses missed, above which a curve is grey
 _CONSISTENT = 0.90, 0.99  # share inside the ellipsoid of 95 % that passes
 
@@ -20,65 +21,75 @@ _CONSISTENT = 0.90, 0.99  # share inside the ellipsoid of 95 % that passes
 def draw(results: Results) -> dict[str, Figure]:
     """Draw the study's figures."""
     coverage, wean, quiet = (results.optional_table(n) for n in ("coverage", "wean", "quiet"))
-    curve = curves(pd.concat([results.table("said"), quiet]))
-    drawn = {"self_knowledge_alarms": draw_alarms(curve)}
+    said = pd.concat([results.table("said"), quiet])
+    drawn = {"self_knowledge_alarms": draw_alarms(said)}
     if coverage is not None:
         drawn["self_knowledge_coverage"] = draw_coverage(coverage)
     if wean is not None:
-        drawn["self_knowledge_wean"] = draw_wean(wean, curve)
+        drawn["self_knowledge_wean"] = draw_wean(wean, curves(said))
     return drawn
 
 
-def curves(said: pd.DataFrame) -> pd.DataFrame:
+def curves(said: pd.DataFrame, planted: str | None = None) -> pd.DataFrame:
     """Share of losses missed against false alarms an hour, by method.
 
     Parameters
     ----------
     said
-        Columns `method`, `kind` and `signal`: of losses, of windows without one, of failed runs.
+        Columns `method`, `planted`, `kind` and `signal`: of losses, of windows without one, of
+        failed runs.
+    planted
+        The fault whose losses count; None: those of every drive. Windows always count all.
     """
+    if planted is not None:
+        said = said[(said["planted"] == planted) | (said["kind"] != "peaks")]
     parts = []
     for method, own in said.groupby("method"):
         both = (own.loc[own["kind"] == kind, "signal"].to_numpy(float) for kind in Evidence._fields)
         evidence = Evidence(*both)
         rows = pd.DataFrame(alarm_curve([evidence]), columns=["threshold", "missed", "false_per_h"])
         failed = int((own["kind"] == "failed").sum())
-        counts = {"losses": len(evidence.peaks), "quiet": len(evidence.quiet), "failed": failed}
-        parts.append(rows.assign(method=method, **counts))
+        numbers = {"losses": len(evidence.peaks), "quiet": len(evidence.quiet), "failed": failed}
+        parts.append(rows.assign(method=method, **numbers))
     return pd.concat(parts, ignore_index=True)
 
 
-def draw_alarms(table: pd.DataFrame) -> Figure:
-    """Share of losses missed against false alarms an hour, a line a method.
+def draw_alarms(said: pd.DataFrame) -> Figure:
+    """Share of losses missed against false alarms an hour, a line a method and a panel a fault.
 
-    Those that miss half of them at one false alarm an hour are grey.
+    Those that miss half of them at one false alarm an hour, with either fault, are grey.
     """
-    page, axes = subplots(6.5, 4.4, 1, 1)
-    known = table.dropna(subset=["missed", "false_per_h"])
-    known = known[known["method"] != "smoother"]  # dead reckoning until it ends
-    missed = known[known["false_per_h"] <= 1.0].groupby("method")["missed"].min()
-    colours, poor = iter(CYCLE), list[str]()
-    for method in missed.sort_values().index:
-        part = known[known["method"] == method]
-        style: dict[str, Any] = {"color": WALL, "lw": 0.8, "alpha": 0.6, "zorder": 1}
-        if missed[method] < _USEFUL:
-            label = f"{method} ({part['losses'].iloc[0]} losses)"
-            style = {"color": next(colours), "lw": 2.0, "label": label}
-        else:
-            poor.append(str(method))
-        axes.step(part["false_per_h"], part["missed"], where="post", **style)
-    if poor:
-        axes.plot([], [], color=WALL, lw=0.8, label=textwrap.fill(", ".join(poor), 70))
-    axes.axvline(1.0, color=BLACK, lw=0.8, ls=":", label="one false alarm an hour")
-    axes.set_xscale("symlog", linthresh=1.0)
-    axes.set_xlim(0.0, 1.1 * known["false_per_h"].max())
-    axes.set_xticks([0.0, 1.0, 10.0, 100.0], ["0", "1", "10", "100"])
-    axes.set(
-        xlabel="false alarms an hour (linear up to 1, logarithmic beyond)",
-        ylabel="share of losses missed",
-        ylim=(-0.02, 1.02),
+    page, panels = subplots(6.5, 4.2, 1, len(_FAULTS), sharey=True)
+    said = said[said["method"] != "smoother"]  # dead reckoning until it ends
+    tables = {
+        fault: curves(said, fault).dropna(subset=["missed", "false_per_h"]) for fault in _FAULTS
+    }
+    missed = pd.DataFrame(
+        {
+            fault: known[known["false_per_h"] <= 1.0].groupby("method")["missed"].min()
+            for fault, known in tables.items()
+        }
     )
-    return with_legend(page, ncols=1)
+    best = missed.min(axis=1).sort_values()
+    useful = [str(method) for method in best.index if best[method] < _USEFUL]
+    colours = dict(zip(useful, CYCLE, strict=False))
+    for axes, (fault, known) in zip(panels, tables.items(), strict=True):
+        for method, part in known.groupby("method"):
+            style: dict[str, Any] = {"color": WALL, "lw": 0.8, "alpha": 0.6, "zorder": 1}
+            if method in colours:
+                style = {"color": colours[str(method)], "lw": 2.0, "label": method}
+            axes.step(part["false_per_h"], part["missed"], where="post", **style)
+        axes.axvline(1.0, color=BLACK, lw=0.8, ls=":", label="one false alarm an hour")
+        axes.set_xscale("symlog", linthresh=1.0)
+        axes.set_xlim(0.0, 1.1 * max(1.0, float(known["false_per_h"].max())))
+        axes.set_xticks([0.0, 1.0, 10.0, 100.0], ["0", "1", "10", "100"])
+        axes.set(xlabel="false alarms an hour", ylim=(-0.02, 1.02), title=_FAULTS[fault])
+    poor = [str(method) for method in best.index if str(method) not in colours]
+    if poor:
+        label = textwrap.fill(", ".join(poor), 40)
+        panels[0].plot([], [], color=WALL, lw=0.8, label=label)
+    panels[0].set(ylabel="share of losses missed")
+    return with_legend(page, ncols=3, of=panels[0])
 
 
 def draw_coverage(table: pd.DataFrame) -> Figure:

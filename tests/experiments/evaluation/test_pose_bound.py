@@ -99,6 +99,18 @@ def random_team(rng: np.random.Generator, n: int) -> Chain:
     return Chain(np.eye(6), *blocks, information, seen._replace(landmarks=numbers))
 
 
+def test_landmarks_that_are_seen_late_tell_nothing_before() -> None:
+    chain = random_team(np.random.default_rng(4), 80)
+    assert chain.sights is not None
+    late = chain.sights.rows >= 40
+    first = list(dict.fromkeys(chain.sights.landmarks[late].tolist()))
+    numbers = np.array([first.index(number) for number in chain.sights.landmarks[late].tolist()])
+    sights = Sights(*(part[late] for part in chain.sights))._replace(landmarks=numbers)
+    online = bound_path(chain._replace(sights=sights)).online
+    wanted = bound_path(chain._replace(sights=None)).online
+    np.testing.assert_allclose(online[:40], wanted[:40], rtol=1e-9)
+
+
 @pytest.mark.parametrize(("seen", "every"), [(0, 1), (4, 1), (4, 3), (-1, 1)])
 def test_bound_is_the_inverse_of_the_joint_information(seen: int, every: int) -> None:
     rng = np.random.default_rng(3)

@@ -29,11 +29,14 @@ def test_a_misread_start_is_a_loss_that_odometry_misses(monkeypatch):
     assert "nothing" not in set(losses["planted"])
     curve = figures.curves(table)
     assert curve["missed"].iloc[-1] == 1.0  # without alarms
-    alert = curve.assign(method="alert", missed=0.0)
-    lines = figures.draw_alarms(pd.concat([curve, alert])).axes[0].get_lines()
-    named = [line.get_label() for line in lines]
-    assert f"alert ({len(losses)} losses)" in named
+    alert = table.assign(method="alert", signal=table["kind"] == "peaks")
+    at_start, lifted = figures.draw_alarms(pd.concat([table, alert])).axes
+    named = [line.get_label() for line in at_start.get_lines()]
+    assert "alert" in named
     assert "odometry" in named  # grey, with all that miss most
+    assert lifted.get_title() == "wheels lifted"
+    of_start = (losses["planted"] == "start").sum()
+    assert set(figures.curves(table, "start")["losses"]) == {of_start}
 
 
 def test_each_method_has_the_drive_and_the_start_that_are_said(monkeypatch):
