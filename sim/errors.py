@@ -47,8 +47,9 @@ def nearest(name: str, known: Iterable[str], place: str = "", there: str = "ther
     >>> nearest("sart", ["map", "start"])
     'did you mean start? there are: start, map'
     """
-    names = list(known)
+    names, first = list(known), str(name).partition(".")[0]
     near = difflib.get_close_matches(str(name), names, n=3)  # a file's may be any value
+    near = near or difflib.get_close_matches(first, names, n=3)
     listed = [f"{place}{one}" for one in dict.fromkeys([*near, *names])]
     meant = f"did you mean {listed[0]}? " if near else ""
     more = f" and {len(listed) - _LISTED} more" if len(listed) > _LISTED else ""

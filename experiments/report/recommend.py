@@ -122,7 +122,11 @@ def recommend(
     on_progress(1.0)
     fits = [each for each in everyone if not each.missing]
     nearest = sorted(_by_table(fits, rows), key=lambda found: found.apart)
-    lines, shown = [f"Fits: {', '.join(each.name for each in fits)}.", ""], set[str]()
+    here = [each.option for each in fits if each.installed]
+    absent = [each.option for each in fits if not each.installed]
+    lines, shown = [f"Fits: {', '.join(here)}.", ""], set[str]()
+    if absent:
+        lines[1:1] = [f"Not installed, but would fit: {', '.join(absent)}."]
     for found in nearest:
         lines += found.lines(fits, shown)
         shown.update(found.rows)

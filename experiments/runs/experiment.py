@@ -262,7 +262,7 @@ class Experiment(Objects):
             require(
                 known_map in ("none", "world"),
                 "prior.map must be none, world, a grid's .yaml file or a mapping with _target_, "
-                f"got {known_map!r}",
+                f"got {'null' if known_map is None else repr(known_map)}",
             )
         else:
             grid_file.read_grid(known_map)

@@ -25,7 +25,7 @@ def colour_of(number: int) -> str:
 
 def path_width(number: int, size: int) -> float:
     """Width of a robot's path, points: each one narrower, so that none hides those below it."""
-    return 1.4 * (size - number)
+    return 1.2 * (size - number)
 
 
 def sightings(robots: Sequence[Recording], number: int) -> tuple[Array, NDArray[np.float64]]:
@@ -55,7 +55,7 @@ def sightings(robots: Sequence[Recording], number: int) -> tuple[Array, NDArray[
 def draw_sightings(ax: Axes, lines: Array, number: int) -> None:
     """Draw a robot's sightings (S, 2, 2), m, in map."""
     colour = colour_of(number)
-    ax.add_collection(LineCollection(list(lines), colors=colour, lw=0.5, alpha=0.6, zorder=1))
+    ax.add_collection(LineCollection(list(lines), colors=colour, lw=0.8, alpha=0.8, zorder=3))
 
 
 def drive_of(robots: Sequence[Recording], until_m: float = math.inf) -> dict[str, Array]:
@@ -80,7 +80,9 @@ def draw_paths(ax: Axes, run: Mapping[str, Array]) -> None:
     size = sum(name.startswith("truth_") for name in run)
     for number in range(size):
         path, colour = run[f"truth_{number}"], colour_of(number)
-        ax.plot(*path.T, color=colour, lw=path_width(number, size), label=f"robot {number}")
-        ax.plot(*path[0], "o", color=colour, mec=BLACK, ms=8, zorder=3)
+        ax.plot(
+            *path.T, color=colour, alpha=0.5, lw=path_width(number, size), label=f"robot {number}"
+        )
+        ax.plot(*path[0], "o", color=colour, mec=BLACK, ms=8, zorder=4)
     ax.plot([], [], "o", color="white", mec=BLACK, ms=8, label="start")
     plan_axes(ax)

@@ -34,6 +34,7 @@ from experiments.viewing.style import (
     subplots,
 )
 
+_SHOWN_M = 300.0  # width of the plan around the particles, at least
 _COLOUR = {"M1": ORANGE, "M2": BLUE, "M3": GREEN}
 _FLOOR_M = {"oxford": 1.0, "umh": 0.03, "campus": 0.1}
 _DESCRIPTORS = {"scan_context": "Scan Context", "ring_key": "ring key", "m2dp": "M2DP"}
@@ -173,8 +174,15 @@ def particles(route: Arrays) -> Figure:
         ax.plot(*robot, "+", color=RED, ms=14, mew=1.5, label="robot")
         ax.plot(*mean, "x", color=BLACK, ms=8, label="estimate")
         error = np.hypot(*(mean - robot))
+        shown = np.vstack([places, robot, mean])
+        middle = (shown.min(axis=0) + shown.max(axis=0)) / 2.0
+        half_m = max(0.6 * float(np.ptp(shown, axis=0).max()), _SHOWN_M / 2.0)
+        (left, bottom), (right, top) = middle - half_m, middle + half_m
         plan_axes(
-            ax, title=f"iteration {step}: particles on {len(places)} nodes, error {error:.1f} m"
+            ax,
+            title=f"iteration {step}: particles on {len(places)} nodes, error {error:.1f} m",
+            xlim=(left, right),
+            ylim=(bottom, top),
         )
     return with_legend(page, ncols=4)
 
