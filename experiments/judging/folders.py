@@ -70,8 +70,9 @@ def _region_page(claim: str) -> dict[str, Any]:
         "alt": (
             f"Left, where {claim} holds for sure, fails for sure, and neither, over the two "
             "settings that decide it most, with the sampled points and the anchor. Middle, the "
-            "ratio that misses first along the first of them, with its 95 % interval. Right, the "
-            "share of the variance that each free setting explains alone."
+            "ratio that misses first along the first of them, with its 95 % interval; orange below "
+            "it, where another ratio fails. Right, the share of the variance that each free "
+            "setting explains alone."
         ),
         "paper": "The paper leaves these settings open; this figure adds them.",
         "claims": [claim],

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import pandas as pd
+from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
@@ -60,12 +61,12 @@ def draw_region(
     if anchor is not None:
         star = {"color": BLACK, "ms": 13, "mec": "white", "clip_on": False, "zorder": 3}
         axes[0].plot(*place[list(of)], "*", label="anchor", **star)
-        axes[1].axvline(place[of[0]], color=BLACK, lw=0.8, ls=":")
+        axes[1].axvline(place[of[0]], color=BLACK, lw=0.8, ls=":", label="anchor (middle)")
     critical = _critical(fitted, place, of)
     _draw_line(axes[1], fitted, critical, place, of[0], printed[critical])
     n, others = len(quantities), "the middle" if anchor is None else "the anchor"
     axes[0].set_title(f"Where it holds\n(other settings at {others})", fontsize="medium")
-    what = f"The most critical of its {n} ratios" if n > 1 else "Its ratio"
+    what = f"The most critical of its {n} ratios" if n > 1 else "The ratio tested"
     axes[1].set_title(f"{what}\n(other settings at {others})", fontsize="medium")
     axes[1].set_ylabel(literal(quantities[critical]))
     for row, i in enumerate(reversed(order)):
@@ -75,7 +76,7 @@ def draw_region(
     axes[2].set_yticks(range(len(order)), names)
     axes[2].set(xlim=(-0.02, 1.02), xlabel="share of the margin's variance\n(first-order index)")
     axes[2].set_title("What decides it", fontsize="medium")
-    return with_legend(page, 7, of=axes[:2])
+    return with_legend(page, 5, of=axes[:2])
 
 
 def _over_two(fitted: Fitted, place: Array, of: tuple[int, int]) -> tuple[Array, Array, Array]:
@@ -101,6 +102,12 @@ def _draw_map(ax: Axes, fitted: Fitted, place: Array, of: tuple[int, int]) -> No
     steps = any(fitted.settings[i].scale is Scale.CHOICE for i in of)
     if not steps and margins[0].min() < 0.0 < margins[0].max():
         ax.contour(across, up, margins[0], levels=[0.0], colors=[BLACK], linewidths=1.4)
+        with rc_context({"hatch.color": WALL, "hatch.linewidth": 0.4}):
+            ax.contourf(across, up, margins[0], levels=[0.0, np.inf], colors="none", hatches=["//"])
+        ax.fill_between(
+            [], [], facecolor="none", edgecolor=WALL, lw=0.5, hatch="//",
+            label="holds by the best estimate",
+        )  # fmt: skip
         ax.plot([], [], color=BLACK, lw=1.4, label="boundary, best estimate")
     for i, axis in zip(of, "xy", strict=True):
         _name_axis(ax, fitted.settings[i], axis)
@@ -132,8 +139,8 @@ def _draw_line(
         for at, *found in zip(u, ratio, low, high, strict=True):
             draw_interval(ax, at, Interval(*found), color=BLACK)
     else:
-        ax.fill_between(u, low, high, color=BLACK, alpha=0.25, lw=0)
-        ax.plot(u, ratio, color=BLACK)
+        ax.fill_between(u, low, high, color=BLACK, alpha=0.25, lw=0, label="95 % interval")
+        ax.plot(u, ratio, color=BLACK, label="best estimate")
     if printed is not None:
         ax.axhline(printed, color=ORANGE, lw=1.4, label="the paper's ratio")
     passing = np.exp(side.needed)
@@ -144,6 +151,12 @@ def _draw_line(
     bottom, top = ax.get_ylim()
     ax.axhspan(max(passing[0], bottom), min(passing[1], top), color=_HOLDS, alpha=0.4, lw=0,
                zorder=0, label="ratios that pass")  # fmt: skip
+    others = np.delete(fitted.margins_apart(snap(fitted.settings, units))[:, 0], headline, axis=0)
+    if (fails := (others < 0.0).any(axis=0)).any():
+        step = 0.5 / (len(u) - (not is_choice))
+        for at in u[fails]:
+            ax.axvspan(at - step, at + step, ymax=0.03, color=ORANGE, lw=0)
+        ax.fill_between([], [], color=ORANGE, lw=0, label="another ratio fails")
     ax.set_ylim(bottom, top)
     values = _round_values(bottom, top, is_log=True)
     ax.set_yticks(values, [_number(v) for v in values])

@@ -25,7 +25,7 @@ def colour_of(number: int) -> str:
 
 def path_width(number: int, size: int) -> float:
     """Width of a robot's path, points: each one narrower, so that none hides those below it."""
-    return 1.2 * (size - number)
+    return 1.0 + 1.2 * (size - number)
 
 
 def sightings(robots: Sequence[Recording], number: int) -> tuple[Array, NDArray[np.float64]]:
@@ -55,7 +55,9 @@ def sightings(robots: Sequence[Recording], number: int) -> tuple[Array, NDArray[
 def draw_sightings(ax: Axes, lines: Array, number: int) -> None:
     """Draw a robot's sightings (S, 2, 2), m, in map."""
     colour = colour_of(number)
-    ax.add_collection(LineCollection(list(lines), colors=colour, lw=0.8, alpha=0.8, zorder=3))
+    ax.add_collection(
+        LineCollection(list(lines), colors=colour, lw=0.7, alpha=0.9, ls=(0, (4, 2)), zorder=3)
+    )
 
 
 def drive_of(robots: Sequence[Recording], until_m: float = math.inf) -> dict[str, Array]:

@@ -115,7 +115,7 @@ def ellipses(office: Arrays, areas: pd.DataFrame, path: pd.DataFrame) -> Figure:
     for ax, name, what in zip(
         top.subplots(1, 2, width_ratios=(1.0, 3.2)),
         "AB",
-        ("a curve", "a corridor with objects, rotated by 90°"),
+        ("a curve", "a corridor with objects (x and y swapped)"),
         strict=True,
     ):
         rows = areas[areas["area"] == name]
@@ -184,7 +184,9 @@ def trajectories(office: Arrays, drawn: pd.DataFrame) -> Figure:
         style = "-" if method == "odometry" else "--"
         ax.plot(*office[method].T, style, color=COLORS[method], lw=1.2, label=NAMES[method])
         off = np.hypot(*(office[method] - office["truth"]).T)
-        below.semilogy(office["stamp_s"], np.maximum(off, 1e-4), color=COLORS[method], lw=1.0)
+        below.semilogy(
+            office["stamp_s"], np.maximum(off, 1e-4), style, color=COLORS[method], lw=1.0
+        )
     ax.set_title(_of_drawn(drawn, "ate_rmse_m", "position RMSE"), size=9)
     top.legend(*ax.get_legend_handles_labels(), loc="outside upper center", ncols=4)
     below.set(xlabel="time, s", ylabel="position error, m")

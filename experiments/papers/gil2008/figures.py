@@ -153,7 +153,7 @@ def world_3d(run: Arrays) -> Figure:
         "walls": {"color": WALL},
         "robot": {"color": BLACK, "marker": "o", "ls": ""},
         "line of sight to a landmark in the image": {"color": SKY},
-        "95 % ellipsoid of such a landmark": {"color": GREEN},
+        "95 % ellipsoid of a landmark in view": {"color": GREEN},
         f"landmarks mapped, {words}": {"color": colour, "marker": ".", "ls": ""},
     }
     handles = [Line2D([], [], label=label, **style) for label, style in styles.items()]
@@ -348,14 +348,14 @@ def by_observations(observations: pd.DataFrame) -> Figure:
 
 _WAYS = {
     "known": (BLACK, "known"),
-    "descriptor": (GREEN, "descriptors, $\\sigma$ = {sigma:g} (right alone: {alone:.0f} %)"),
+    "descriptor": (GREEN, "descriptors, $\\sigma$ = {sigma:g} (alone correct: {alone:.0f} %)"),
     "mahalanobis": (ORANGE, "Mahalanobis, $p_0$ = {p0:g}"),
     "ekf_slam": (RED, "EKF-SLAM, Mahalanobis"),
 }
 
 
 def by_association(association: pd.DataFrame) -> Figure:
-    """Error and share of right associations for every way to associate."""
+    """Error and share of correct associations for every way to associate."""
     way = association["association"].where(association["filter"] != "ekf_slam", "ekf_slam")
     association = association.assign(way=pd.Categorical(way, list(_WAYS)))
     # EKF-SLAM stands by the particle filter that takes R at the same point
@@ -390,7 +390,7 @@ def by_association(association: pd.DataFrame) -> Figure:
         right.set(xlim=(0.0, 1.0))
         right.tick_params(axis="y", left=False, labelleft=False)
     left.set(xlabel="path error over odometry's (tick: a world;\ndiamond: RMS; dotted: a half)")
-    right.set(xlabel="share of right associations")
+    right.set(xlabel="share of correct associations")
     return page
 
 
@@ -443,7 +443,7 @@ def cost(table: pd.DataFrame) -> Figure:
         wide = part.groupby("n_landmarks")["step_ms"]
         style = {"marker": "o", "ms": 4, "color": colour}
         ax.plot(wide.median(), "-", label=f"{words} maps: median", **style)
-        ax.plot(wide.quantile(0.95), "--", label=f"{words} maps: 95 % of the steps", **style)
+        ax.plot(wide.quantile(0.95), "--", label=f"{words} maps: 95th percentile", **style)
     set_axes(
         ax,
         xscale="log",

@@ -70,13 +70,13 @@ def data(campus: Arrays) -> Figure:
     """Figure 1: clouds at the nodes of the map and along the robot's way, seen from above."""
     page, axes = subplots(9.5, 4.8, 1, 2, sharex=True, sharey=True)
     both = {
-        "nodes of the map and their clouds": ("map", BLUE),
-        "observations in the adjacent lane": ("query", RED),
+        "map nodes (x) and their clouds": ("map", BLUE),
+        "queries in the adjacent lane (x) and their clouds": ("query", RED),
     }
     for ax, (words, (name, colour)) in zip(axes, both.items(), strict=True):
         ax.plot(*campus[f"{name}_clouds_m"].T, ".", color=colour, ms=1.8, mew=0)
         ax.plot(*campus[f"{name}_spots_m"].T, "x", color=BLACK, ms=9, mew=2)
-        ax.set_title(f"{words} (x)", fontsize="medium")
+        ax.set_title(words, fontsize="medium")
     # what lies within 40 m of the nodes
     shown = np.concatenate([line.get_xydata() for ax in axes for line in ax.get_lines()])
     near = shown[np.hypot(*(shown - campus["map_spots_m"].mean(axis=0)).T) < 40.0]
@@ -170,7 +170,9 @@ def particles(route: Arrays) -> Figure:
         places, counts = np.unique(cloud, axis=0, return_counts=True)
         sizes = 12.0 + 160.0 * counts / counts.sum()
         ax.plot(*route["nodes_m"].T, ".", color="#BBBBBB", ms=2, label="nodes")
-        ax.scatter(*places.T, s=sizes, color=BLUE, alpha=0.7, lw=0, label="particles")
+        ax.scatter(
+            *places.T, s=sizes, color=BLUE, alpha=0.7, lw=0, label="particles (area: how many)"
+        )
         ax.plot(*robot, "+", color=RED, ms=14, mew=1.5, label="robot")
         ax.plot(*mean, "x", color=BLACK, ms=8, label="estimate")
         error = np.hypot(*(mean - robot))
@@ -214,8 +216,8 @@ def table_2(table: pd.DataFrame) -> Figure:
     """Table 2: error and time per node by the number of particles, beside the paper's."""
     table = table[table["geometry"].isin(headlines(table["geometry"]))]
     page, columns = _columns(table, 4.2, 0.6, 5.4, n_rows=2)
-    here: Any = {"fmt": "o-", "color": BLUE, "label": "here ± deviation of the repeats"}
-    paper: Any = {"fmt": "D--", "color": RED, "label": "paper ± its deviation"}
+    here: Any = {"fmt": "o-", "color": BLUE, "label": "here ± standard deviation over repeats"}
+    paper: Any = {"fmt": "D--", "color": RED, "label": "paper ± its standard deviation"}
     for (upper, lower), name, part in columns:
         n = part["particles"]
         upper.errorbar(n, part["error_m"], part["sd_repeats_m"], capsize=3, **here)
@@ -226,7 +228,7 @@ def table_2(table: pd.DataFrame) -> Figure:
         lower.errorbar(n, 1e3 * part["paper_time_s"], **paper)
         lower.set(xlabel="particles", yscale="log")
     columns[0][0][0].set(ylabel="mean error, m")
-    columns[0][0][1].set(ylabel="time a node, ms")
+    columns[0][0][1].set(ylabel="time per node, ms")
     return with_legend(page, ncols=2)
 
 

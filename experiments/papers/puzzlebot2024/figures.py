@@ -40,7 +40,7 @@ _METHODS = {
     "linearised": "end poses, linearised",
 }
 _ROBOTS = {
-    "puzzlebot": "nominal geometry right",
+    "puzzlebot": "nominal geometry correct",
     "puzzlebot_short_turns": "turns 0.44 of the command",
 }
 _FEEDBACKS = {"truth": "steered by the true pose", "odometry": "steered by odometry"}
@@ -135,7 +135,7 @@ def ellipse_area(areas: pd.DataFrame, crossover: pd.DataFrame, straight: Arrays)
 def _crossover(ax: Axes, crossover: pd.DataFrame, straight: Arrays) -> None:
     """Draw the two spreads along a straight; they cross at track sqrt(3) / 2."""
     distance, spread = (1000.0 * straight[name] for name in ("distance_m", "sigma_m"))
-    ax.plot(distance, spread[:, 0], color=BLUE, label="along the way, by translation")
+    ax.plot(distance, spread[:, 0], color=BLUE, label="along the path, by translation")
     ax.plot(distance, spread[:, 1], color=ORANGE, label="across, by heading")
     theory, found = 1000 * NOMINAL.track_m * np.sqrt(3.0) / 2.0, 1000 * crossover["crossover_m"]
     ax.axvline(theory, color=BLACK, lw=0.8, ls=":")
@@ -172,8 +172,8 @@ def calibration(table: pd.DataFrame) -> Figure:
     axes[0, 0].set(xscale="log", xlim=(0.4, 6.5), **ticks)
     plain_ticks(axes[0, 0], [0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 4.0])
     page.supxlabel(
-        "estimate over the truth: histogram, its mean (dot), mean 95 % interval (bar);\n"
-        "right: share of the intervals that hold the truth",
+        "estimate over true value: histogram (its ends hold what lies beyond), mean (dot),\n"
+        "mean 95 % interval (bar); numbers: share of the intervals that contain the true value",
         fontsize="medium",
     )
     return page
@@ -182,14 +182,15 @@ def calibration(table: pd.DataFrame) -> Figure:
 def _estimates(ax: Axes, part: pd.DataFrame, level: int, color: str) -> None:
     """Draw one method's estimates of one wheel at a height."""
     ratios = part["value"] / part["truth"]
-    counts, edges = np.histogram(ratios, bins=np.geomspace(0.4, 4.6, 99))
+    bins = np.geomspace(0.4, 4.6, 99)
+    counts, edges = np.histogram(ratios.clip(bins[0], bins[-1]), bins)
     ax.stairs(level + 0.75 * counts / max(counts.max(), 1), edges, baseline=level, fill=True,
               color=color, alpha=0.5)  # fmt: skip
     ends = [float((part[end] / part["truth"]).mean()) for end in ("low", "high")]
     ax.plot(ends, [level - 0.08] * 2, color=color, lw=2.0, solid_capstyle="butt")
     ax.plot(ratios.mean(), level - 0.08, "o", color=BLACK, ms=3)
     covered = part["truth"].between(part["low"], part["high"]).mean()
-    ax.annotate(f"{covered:.2f}", (0.99, level + 0.1), xycoords=("axes fraction", "data"),
+    ax.annotate(f"{covered:.2f}", (0.99, level + 0.3), xycoords=("axes fraction", "data"),
                 ha="right", fontsize="small")  # fmt: skip
 
 
@@ -203,7 +204,7 @@ def table_1(table: pd.DataFrame) -> Figure:
     ):
         mean, sd = (table[f"{real}_{name}_{unit}"] for name in ("mean", "sd"))
         off = 1e3 * (mean - table[ideal])
-        ax.errorbar(off, table.index, xerr=1e3 * sd, fmt="o", color=BLUE, ms=4)
+        ax.errorbar(off, table.index, xerr=1e3 * sd, fmt="o", color=BLACK, ms=4)
         ax.axvline(0.0, color=BLACK, lw=0.8)
     for k, (name, color, share) in enumerate((("kr", BLUE, 1.5), ("kl", ORANGE, 0.5))):
         value, *ends = (1e4 * table[f"{name}{end}_m"] for end in ("", "_low", "_high"))
@@ -224,7 +225,7 @@ def table_1(table: pd.DataFrame) -> Figure:
         xlim=(0.0, None),
     )
     page.suptitle(
-        f"{CALIBRATION_RUNS} runs a case; ends: mean and standard deviation; slip: 95 % interval",
+        f"{CALIBRATION_RUNS} runs per case; ends: mean and standard deviation; slip: 95 % interval",
         size=9,
     )
     return with_legend(page, ncols=2, of=slip)
@@ -256,8 +257,8 @@ def table_1_short_turns(table: pd.DataFrame) -> Figure:
         for row in table.itertuples()
     ]
     title = (
-        f"table 1 by the robot that under-rotates, {CALIBRATION_RUNS} runs a case; "
-        f"the report: turns come out at {REPORTED_TURN_RATIO} of the ideal ones"
+        f"Table 1, driven by a robot that turns by {REPORTED_TURN_RATIO} of what is commanded, "
+        f"as the report's does ({CALIBRATION_RUNS} runs per case)"
     )
     return draw_table(header, cells, title, (9.0, 3.4))
 
@@ -288,8 +289,8 @@ def short_turns(ends: pd.DataFrame, found: pd.DataFrame) -> Figure:
         label=f"{REPORTED_TURN_RATIO} of it, as the report says",
     )
     for who, color, label in (
-        ("real", ORANGE, "as the robot came"),
-        ("calibrated", BLUE, "with the track found by calibration"),
+        ("real", ORANGE, "uncalibrated"),
+        ("calibrated", BLUE, "with the calibrated track"),
     ):
         left.errorbar(
             ideal,
@@ -301,7 +302,15 @@ def short_turns(ends: pd.DataFrame, found: pd.DataFrame) -> Figure:
             label=label,
         )
     case_4 = float(ends.set_index("case").loc["angular_4", "ideal_heading_rad"])
-    left.plot(case_4, REPORTED_ENDS["angular_4"], "x", color=BLACK, label="the report's example")
+    left.plot(
+        case_4,
+        REPORTED_ENDS["angular_4"],
+        "x",
+        color=BLACK,
+        ms=9,
+        zorder=4,
+        label="the report's example",
+    )
     set_axes(left, xlabel="turn commanded, rad", ylabel="turn driven, rad")
     for i, row in enumerate(found.itertuples()):
         is_gain = row.parameter.startswith("bias")
@@ -313,7 +322,7 @@ def short_turns(ends: pd.DataFrame, found: pd.DataFrame) -> Figure:
         right.plot([low, high], [i, i], color=BLUE, lw=2.0)
         right.plot(value, i, "o", color=BLUE, ms=5, label="found, 95 % interval" if not i else None)
         if nominal > 0.0:
-            named = {"label": "what the controller takes"} if row.parameter == "track_m" else {}
+            named = {"label": "assumed by the controller"} if row.parameter == "track_m" else {}
             right.plot(nominal, i + 0.18, "v", color=ORANGE, **named)
     right.axvline(1.0, color=BLACK, lw=0.8)
     set_axes(

@@ -41,7 +41,7 @@ def slip(means: pd.DataFrame) -> Figure:
     set_axes(
         ax,
         xscale="log",
-        xlabel="position RMSE of the best answer, m",
+        xlabel="position RMSE of the final path, m",
         ylim=(-0.6, len(order) - 0.4),
         yticks=range(len(order)),
         yticklabels=names,

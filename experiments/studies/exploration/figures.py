@@ -35,7 +35,7 @@ def drives(runs: dict[str, dict[str, Any]]) -> Figure:
     page, panels = subplots(10.0, 5.6, 1, 2)
     for ax, (strategy, run) in zip(panels, runs.items(), strict=True):
         draw_paths(ax, run)
-        ax.set_title(f"{NAMES[strategy]}, {AFTER_M:g} m a robot")
+        ax.set_title(f"{NAMES[strategy]}, {AFTER_M:g} m per robot")
     return with_legend(page, ncols=4)
 
 

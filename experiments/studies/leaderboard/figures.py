@@ -41,7 +41,7 @@ def errors(means: pd.DataFrame) -> Figure:
     set_axes(
         ax,
         xscale="log",
-        xlabel="position RMSE of the best answer, m: geometric mean, 95 % interval",
+        xlabel="position RMSE of the final path, m: geometric mean, 95 % interval",
         ylim=(-0.6, len(order) - 0.4),
         yticks=range(len(order)),
         yticklabels=[f"{name} (revised)" if name in revised else name for name in order],

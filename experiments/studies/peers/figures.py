@@ -18,7 +18,7 @@ from experiments.viewing.style import BLUE, ORANGE, WALL, subplots
 _BOARDS = [(s, a) for s in (LASER, MAP, STEREO) for a in ("online", "revised")]
 _ENDS = ("ate_low_m", "ate_high_m")
 _ANSWERS = {"online": "", "revised": ", revised"}
-_KINDS = {"relations": "relations", "fit to the map": "beams off walls"}
+_KINDS = {"relations": "relations", "fit to the map": "beam-to-wall distance"}
 _REVISED = Line2D([], [], color=WALL, ls="", marker="s", ms=6, label="revised path")
 _FAILED = Line2D([], [], color=WALL, ls="", marker="x", ms=6, label="failed")
 _PLACES = {"all classes": "", **{name: f"_{name}" for name in CLASSES}}
@@ -60,6 +60,9 @@ def errors(methods: pd.DataFrame) -> Figure:
                 colour = BLUE if is_ours(row["estimator"]) else ORANGE
                 filled = colour if row[f"level{place}"] else "white"
                 axes.plot([low, high], [y, y], color=colour, lw=1.2)
+                for end, beyond, arrow in ((0, low < limits[0], "<"), (1, high > limits[1], ">")):
+                    if beyond:
+                        axes.plot(limits[end], y, arrow, color=colour, ms=4, clip_on=False)
                 axes.plot(value, y, "o", ms=5, color=colour, mfc=filled)
             set_axes(axes, xscale="log", xlim=limits, ylim=(-0.7, len(part) - 0.3))
             axes.xaxis.set_major_locator(LogLocator(numticks=20))

@@ -43,7 +43,7 @@ def intel(relations: pd.DataFrame, paths: Arrays) -> Figure:
     methods = list(dict.fromkeys(rows.method))[::-1]
     printed = rows.method.str.contains("printed")
     for part, color, shift, label in (
-        (rows[(rows.part == "judged")], CYCLE[0], 0.2, "after the part tuned on (judged)"),
+        (rows[(rows.part == "judged")], CYCLE[0], 0.2, "judged part (after the tuning part)"),
         (rows[(rows.part == "all") & ~printed], "#9cc9e6", -0.2, "whole log"),
         (rows[printed], "#bbbbbb", -0.2, "whole log, as printed"),
     ):
@@ -87,8 +87,8 @@ def mrclam(errors: pd.DataFrame, paths: Arrays) -> Figure:
         set_axes(ax, xscale="log", ylim=(-0.6, len(shown) - 0.4), yticks=range(len(shown)))
     left.set_yticklabels(shown)
     middle.set_yticklabels([])
-    left.set(xlabel="position RMSE after 300 s, m")
-    left.set_title("MRCLAM 6: a dot a robot, a bar the median", fontsize="medium")
+    left.set(xlabel="position RMSE from 300 s on, m")
+    left.set_title("MRCLAM 6 (dot: one robot, bar: median)", fontsize="medium")
     middle.set(xlabel="mean NEES / 3 (dotted: 1, consistent)")
     middle.axvline(1.0, color=BLACK, lw=0.9, ls=":")
     plain_log(left.xaxis)
@@ -135,14 +135,14 @@ def wean(fits: pd.DataFrame, drawn: Arrays) -> Figure:
         ax.set_facecolor("#dfe6ee")
         ax.plot(*drawn[f"ends_{row.log}"].T, ".", color=CYCLE[4], ms=1.2, label="beam ends")
         ax.plot(*drawn[f"path_{row.log}"].T, color=CYCLE[0], lw=1.2, label="path (ICP)")
-        ax.plot(row.x_m, row.y_m, "o", color=CYCLE[0], ms=4)
+        ax.plot(row.x_m, row.y_m, "o", color=CYCLE[0], ms=4, label="start")
         seen = np.concatenate([drawn[f"{name}_{row.log}"] for name in ("ends", "path")])
         low, high = np.nanmin(seen, axis=0) - 2.0, np.nanmax(seen, axis=0) + 2.0
         plan_axes(
             ax,
             xlim=np.clip((low[0], high[0]), *drawn["extent_m"][:2]),
             ylim=np.clip((low[1], high[1]), *drawn["extent_m"][2:]),
-            title=f"Wean Hall, log {row.log}: fit {row.score:.2f}, "
-            f"start {math.degrees(row.yaw_rad):.0f}°",
+            title=f"Wean Hall, log {row.log}: on walls: {row.score:.2f}, "
+            f"start heading {math.degrees(row.yaw_rad):.0f}°",
         )
     return with_legend(page, ncols=2, of=ax, markerscale=6)

@@ -118,13 +118,17 @@ def draw_wean(table: pd.DataFrame, curve: pd.DataFrame) -> Figure:
     above.plot(time_s, table["apart_m"], color=lifted)
     above.set(ylabel="distance between\nthe two paths, m", ylim=(0.0, None))
     below.plot(
-        time_s, table["lost_lifted"], color=lifted, lw=0.8, label="wheels lifted for a while"
+        time_s,
+        table["lost_lifted"],
+        color=lifted,
+        lw=0.8,
+        label="mcl, wheels lifted in the grey band",
     )
-    below.plot(time_s, table["lost"], color=logged, lw=0.8, label="as logged")
+    below.plot(time_s, table["lost"], color=logged, lw=0.8, label="mcl, as logged")
     own = curve[(curve["method"] == "mcl") & (curve["false_per_h"] <= 1.0)]
     threshold = own["threshold"].min()
-    below.axhline(threshold, color="#999999", lw=0.8, ls=":", label="alarm (set in simulation)")
+    below.axhline(threshold, color="#999999", lw=0.8, ls=":", label="alarm, from simulated drives")
     for axes in (above, below):
-        axes.axvspan(*np.quantile(time_s, LIFTED), color="#e0e0e0", lw=0, label="wheels lifted")
-    below.set(xlabel="time, s", ylabel="misfit of the scan\n(`lost`)", ylim=(0.0, 1.02))
-    return with_legend(page, ncols=4, of=below)
+        axes.axvspan(*np.quantile(time_s, LIFTED), color="#e0e0e0", lw=0)
+    below.set(xlabel="time, s", ylabel="scan misfit\n(signal lost)", ylim=(0.0, 1.02))
+    return with_legend(page, ncols=3, of=below)

@@ -40,7 +40,7 @@ def drive(run: dict[str, Any]) -> Figure:
     draw_paths(ax, run)
     for number in range(sum(name.startswith("truth_") for name in run)):
         draw_sightings(ax, run[f"sightings_{number}"].reshape(-1, 2, 2), number)
-    ax.plot([], [], color=WALL, lw=0.8, label="sighting (colour: who sees)")
+    ax.plot([], [], color=WALL, lw=0.8, ls=(0, (4, 2)), label="sighting (colour: who sees)")
     return with_legend(page, ncols=4)
 
 
