@@ -41,10 +41,9 @@ def empty(*, rng: np.random.Generator, tour_m: float = 10.0) -> World:
     return plan.world("empty", rng)
 
 
-def from_file(*, rng: np.random.Generator, path: str | None = None) -> World:
+def from_file(*, rng: np.random.Generator, path: str) -> World:
     """Read a user's world; see `sim.worlds.world_file` for the format. Nothing in it is random."""
     del rng
-    path = required(path, "world.path must name a world's .yaml, such as my_world.yaml")
     return read_world(Path(path))
 
 
