@@ -15,14 +15,11 @@ class Unexplained:
     def __init__(self) -> None:
         self._noted: deque[tuple[float, int, int]] = deque()
 
-    def note(self, stamp_s: float, unexplained: int, of: int = 1) -> None:
-        """Note readings of one instant, and how many of them were improbable under the belief."""
-        if of:
-            self._noted.append((stamp_s, unexplained, of))
-        while self._noted and self._noted[0][0] <= stamp_s - _WINDOW_S:
-            self._noted.popleft()
+    def note(self, stamp_s: float, unexplained: int, of: int) -> None:
+        """Note how many of the readings of one instant were improbable under the belief."""
+        self._noted.append((stamp_s, unexplained, of))
 
-    def lost(self, covariance: Array) -> float:
+    def lost(self, stamp_s: float, covariance: Array) -> float:
         """How far to believe that one is lost, from 0 to 1.
 
         One is not if a reading drawn from the last ones was explained and the position is right
@@ -34,6 +31,8 @@ class Unexplained:
         covariance
             (3, 3) of the pose.
         """
+        while self._noted and self._noted[0][0] <= stamp_s - _WINDOW_S:
+            self._noted.popleft()
         unexplained, of = sum(far for _, far, _ in self._noted), sum(n for *_, n in self._noted)
         (xx, xy), (_, yy) = covariance[0, :2].tolist(), covariance[1, :2].tolist()
         worst_m2 = (xx + yy) / 2.0 + math.hypot((xx - yy) / 2.0, xy)

@@ -164,12 +164,13 @@ class GraphSlam(GraphSlamOptions):
             extras["registration_status"] = status
             if status not in ("first", "ok", "degenerate"):
                 extras["status"] = status
-            self._unexplained.note(frame.stamp, "status" in extras)
+            if scan is not None:  # without returns nothing denies the pose
+                self._unexplained.note(frame.stamp, "status" in extras, 1)
         extras["closures"] = len(self.graph.closures)
         self._path.append(_Placed(frame.stamp, len(self.graph) - 1, self._in_key))
         belief = _symmetric(self.graph.newest.then(self._in_key))
         if reading is not None:
-            extras["lost"] = self._unexplained.lost(belief.covariance)
+            extras["lost"] = self._unexplained.lost(frame.stamp, belief.covariance)
         return Belief(belief.mean, belief.covariance, extras)
 
     def finish(self) -> Estimate:

@@ -173,7 +173,7 @@ class EkfSlam(EkfSlamOptions, TeamEstimator):
         else:
             pose = pose.then(self._motions[frame.robot])
         if "associations" in extras and self.front_end.identified:
-            extras["lost"] = self._unexplained[frame.robot].lost(pose.covariance)
+            extras["lost"] = self._unexplained[frame.robot].lost(frame.stamp, pose.covariance)
         if self.keep_map:
             extras |= {k: v for k, v in self.map.items() if k.startswith("landmark")}
         return Belief(pose.mean.copy(), (pose.covariance + pose.covariance.T) / 2.0, extras)

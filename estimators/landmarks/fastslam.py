@@ -152,7 +152,7 @@ class FastSLAM(FastSlamOptions, TeamEstimator):
             "best": compose(path.drawn[self._best], path.rolled.mean)[0],
         }
         if "associations" in extras and self.front_end.identified:
-            extras["lost"] = self._unexplained[frame.robot].lost(belief.covariance)
+            extras["lost"] = self._unexplained[frame.robot].lost(frame.stamp, belief.covariance)
         if self.keep_map:
             extras |= {k: v for k, v in self.map.items() if k.startswith("landmark")}
         path.note(frame.stamp)

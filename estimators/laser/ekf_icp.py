@@ -151,13 +151,14 @@ class EkfIcp(EkfIcpOptions):
         if scan is not None and self._is_due():
             prepared = self.matcher.prepare(scan["ranges_m"], self._laser, moved, frame.duration_s)
             self._correct(prepared, extras)
-            self._unexplained.note(frame.stamp, "status" in extras)
+            if prepared is not None:  # without returns nothing denies the pose
+                self._unexplained.note(frame.stamp, "status" in extras, 1)
         by_twist, by_bias = _from_twist(self._mean[_POSE]), self._by_bias[_POSE]
         covariance = self._covariance[_POSE, _POSE] + by_bias @ self._biases_m2 @ by_bias.T
         covariance = by_twist @ covariance @ by_twist.T
         mean = self._mean[_POSE] + self._origin
         if scan is not None:
-            extras["lost"] = self._unexplained.lost(covariance)
+            extras["lost"] = self._unexplained.lost(frame.stamp, covariance)
         return Belief(mean, (covariance + covariance.T) / 2.0, extras)
 
     def _predict(self, frame: Frame) -> Array:

@@ -75,6 +75,8 @@ def bound_team(team: Team, priors: Sequence[Prior], names: Iterable[str]) -> lis
     """
     first, starts = team.robots[0], [prior.covariance for prior in priors]
     read = tuple(name for name in names if not isinstance(first.sensors.get(name), Encoder))
+    if len(team) == 1:  # alone, it knows the place of no other robot
+        read = tuple(n for n in read if not isinstance(first.sensors.get(n), RobotCamera))
     blind = any(isinstance(first.sensors.get(name), Laser) for name in read)
     if blind and any(prior.map is None for prior in priors):
         return None
@@ -199,11 +201,12 @@ def _inform(
     seen = np.asarray(recording.known_truth.readings[name]["true_ids"], np.int64)
     frames = np.repeat(frames, np.diff(log.known_splits))
     if isinstance(sensor, RobotCamera):
-        every, own_frames = poses[seen, frames], frames
-        for robot in np.unique(seen):
-            of = (seen == robot) & np.isfinite(every[:, 0])
+        own_frames = frames
+        for robot in np.unique(seen[seen < len(poses)]):
+            theirs = poses[robot, own_frames]
+            of = (seen == robot) & np.isfinite(theirs[:, 0])
             frames = own_frames[of]
-            markers = np.column_stack([every[of, :2], np.full(of.sum(), sensor.marker_z_m)])
+            markers = np.column_stack([theirs[of, :2], np.full(of.sum(), sensor.marker_z_m)])
             told, cross, other = stereo_information(sensor.camera, poses[number, frames], markers)
             flat = np.diag([1.0, 1.0, 0.0])  # its height is known, and no heading is seen
             add(told, number, number)

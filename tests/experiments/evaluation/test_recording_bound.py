@@ -187,6 +187,15 @@ def test_of_a_team_is_the_bound_written_plainly():
         np.testing.assert_allclose(np.diagonal(bound.online, 0, 1, 2), own.T, rtol=5e-3, atol=1e-9)
 
 
+def test_a_robot_of_a_team_alone_has_the_bound_without_sightings():
+    both = Experiment.compose([*TEAM]).recordings()
+    one = Experiment.compose([*TEAM])
+    for robot, prior in zip(both.robots, one.priors(both), strict=True):
+        with_others = bounds.bound_recording(robot, prior, ["stereo", "robots"])
+        without = bounds.bound_recording(robot, prior, ["stereo"])
+        np.testing.assert_array_equal(with_others.online, without.online)
+
+
 def test_robots_that_see_each_other_know_more():
     met, alone = (
         bound_columns(*TEAM[:-1], f"estimator.robots={robots}") for robots in ("robots", "null")
