@@ -284,7 +284,8 @@ class EkfSlam(EkfSlamOptions, TeamEstimator):
         if known.any():
             in_base = self._camera.place(np.zeros(3), image.points[known])[..., :2]
             doubt.note(old, in_base, passed[known])
-        self._unexplained[robot].note(self._now_s, *2 * (int((~passed[known]).sum()),))
+        n_rejected = int((~passed[known]).sum())  # those that pass are counted by the update
+        self._unexplained[robot].note(self._now_s, n_rejected, n_rejected)
         if passed[known].any():
             self._n_trusted[robot] = self._n_landmarks
         return passed & (known | (not doubt.rises))
@@ -346,9 +347,10 @@ class EkfSlam(EkfSlamOptions, TeamEstimator):
         S += by_other
         for k in range(len(at)):
             S[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] += R[k]
-        own_S = S.reshape(len(at), 3, len(at), 3)[every := np.arange(len(at)), :, every]
-        far = mahalanobis_squared(v, own_S) > self.d0
-        self._unexplained[own.start // 3].note(self._now_s, int(far.sum()), len(at))
+        if self.front_end.identified:  # else those that are far count as new
+            own_S = S.reshape(len(at), 3, len(at), 3)[every := np.arange(len(at)), :, every]
+            far = mahalanobis_squared(v, own_S) > self.d0
+            self._unexplained[own.start // 3].note(self._now_s, int(far.sum()), len(at))
         correction = self._state.update(HP, S, v)
         if correction is not None:
             self._correct(correction)

@@ -124,9 +124,10 @@ def recommend(
     nearest = sorted(_by_table(fits, rows), key=lambda found: found.apart)
     here = [each.option for each in fits if each.installed]
     absent = [each.option for each in fits if not each.installed]
-    lines, shown = [f"Fits: {', '.join(here)}.", ""], set[str]()
+    lines, shown = [f"Fits: {', '.join(here)}."], set[str]()
     if absent:
-        lines[1:1] = [f"Not installed, but would fit: {', '.join(absent)}."]
+        lines.append(f"Not installed, but would fit: {', '.join(absent)}.")
+    lines.append("")
     for found in nearest:
         lines += found.lines(fits, shown)
         shown.update(found.rows)

@@ -33,6 +33,9 @@ def test_it_is_the_share_of_the_last_five_seconds():
     assert unexplained.lost(4.0, sure) == pytest.approx(2 / 4)
     assert unexplained.lost(5.0, sure) == pytest.approx(1 / 3)
     assert unexplained.lost(9.0, sure) == 0.0  # nothing was read since
+    for stamp_s in range(100):  # nor does it grow if nobody asks
+        unexplained.note(float(stamp_s), 1, 1)
+    assert len(unexplained._noted) == 5
 
 
 def test_a_pose_that_is_not_known_is_lost():
