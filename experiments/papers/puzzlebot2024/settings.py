@@ -27,10 +27,10 @@ LOOPS = {
 }
 # The report's two examples and two of ours: ideal and real end, m or rad, and time, s
 DESCENTS = {
-    "report, kl: 2.445 to 2.347 m in 5 s": (2.445330811, 2.34674, 5.0),
-    "report, kr: 2.312 to 1.064 rad in 3 s": (2.312493295, 1.06419, 3.0),
-    "1 to 2 m in 2 s": (1.0, 2.0, 2.0),
-    "1 to 6 m in 2 s": (1.0, 6.0, 2.0),
+    "report, kl: ideal 2.445 m, real 2.347 m, 5 s": (2.445330811, 2.34674, 5.0),
+    "report, kr: ideal 2.312 rad, real 1.064 rad, 3 s": (2.312493295, 1.06419, 3.0),
+    "ideal 1 m, real 2 m, 2 s": (1.0, 2.0, 2.0),
+    "ideal 1 m, real 6 m, 2 s": (1.0, 6.0, 2.0),
 }
 # The report: turns come out at 0.44 of the ideal ones (below table 1). The example data of its
 # programs fit two cases of table 1 by their times and ends (m or rad); the ideal ends are a

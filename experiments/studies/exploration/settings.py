@@ -8,7 +8,7 @@ NAMES = {  # of the strategies, in words
     BASE: "nearest frontier",
     JUDGED: "shared out by cost",
     GAIN: "information gain",
-    BOTH: "shared out and weighed by gain",
+    BOTH: "shared out, weighted by gain",
 }
 AFTER_M = 15.0  # driven a robot, after which the area is judged
 RESOLUTION_M = 0.2  # of the area
