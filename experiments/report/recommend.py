@@ -18,7 +18,7 @@ from experiments.runs.compose import Composer, open_composer
 from experiments.runs.experiment import Experiment
 from experiments.runs.row import read_rows
 from experiments.runs.schema import leaves
-from sim.errors import InputError, require
+from sim.errors import require
 
 Setting = dict[str, Any]
 _ERROR = "answer_ate_rmse_m"
@@ -148,14 +148,14 @@ def _candidates(
         on_progress(_COMPOSED * number / len(options))
         asked = [*overrides, f"estimator={option}"]
         experiment = Experiment(*composer.compose(asked).resolve())
+        if experiment.config["estimator"].get("command", option) is None:
+            continue  # a program of the user's, and none is named
         missing = experiment.missing()
         try:
             if not missing:
                 experiment.check()
         except MissingPackageError:
             yield Candidate(option, experiment, installed=False)
-        except InputError:  # a program without a command
-            continue
         else:
             yield Candidate(option, experiment, missing)
 

@@ -235,6 +235,8 @@ class Experiment(Objects):
             words.append("a topological map (prior.map._target_)")
         elif "map" in needs and known_map == "none" and not settings.get("map_path"):
             words.append("a map (prior.map=world)")
+        if self.config["prior"]["start"] == "global" and "map" not in needs:
+            words.append("a known start (prior.start=tracking)")  # only a map tells where it is
         return words
 
     def _check_needs(self) -> None:

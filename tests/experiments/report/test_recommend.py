@@ -59,6 +59,14 @@ def test_a_wheel_has_no_tables_and_says_so(tmp_path, monkeypatch):
     assert "estimator=odometry" in sweep
 
 
+def test_without_a_known_start_only_what_has_a_map_fits(monkeypatch):
+    monkeypatch.setattr(paths, "option_names", lambda group: ["ekf_icp", "mcl"])
+    text, sweep = recommend(["sensors=hokuyo", "prior.map=world", "prior.start=global"])
+    assert "Fits: mcl." in text
+    assert "Needs a known start (prior.start=tracking): ekf_icp." in text
+    assert "estimator=mcl" in sweep
+
+
 def test_wrong_overrides_are_refused():
     with pytest.raises(InputError, match="leave the estimator out"):
         recommend(["estimator=mcl"])
