@@ -1,6 +1,6 @@
 """Pages of the documentation that are made from the code, by a hook of mkdocs (mkdocs.yml).
 
-Commands, configuration keys, estimators, metrics and the gallery of figures. The pages exist only
+Commands, configuration keys, estimators, metrics, claims and the gallery of figures. The pages exist only
 while mkdocs builds the site, so nothing in them is written twice.
 """
 
@@ -13,6 +13,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 import yaml
 from mkdocs.structure.files import File
 
@@ -57,6 +58,7 @@ def pages() -> dict[str, str]:
         "reference/metrics.md": "\n".join(_metrics()),
         "reference/estimators/index.md": "\n".join(_estimators(names)),
         **{f"reference/estimators/{_page(name)}": text for name, text in _each(names)},
+        "reference/claims.md": "\n".join(_claims()),
         "gallery.md": "\n".join(_gallery()),
     }
 
@@ -232,6 +234,23 @@ def _on_the_boards(name: str, rows: list[Judged], times: Mapping[str, float]) ->
 
 def _page(name: str) -> str:
     return f"{name.replace('/', '_')}.md"
+
+
+# Claims
+
+
+def _claims() -> Iterator[str]:
+    yield (
+        "# Claims\n\nEach claim, its verdict, and what was measured. The same is in "
+        "`results/verdicts.csv`, and `estima reproduce` judges all again from the tables. "
+        "`results/claims.csv` has every number with its interval and its criterion; where in the "
+        "code a claim is judged, [The papers](../papers.md) says.\n"
+    )
+    verdicts = pd.read_csv(ROOT / "results" / "verdicts.csv", keep_default_na=False)
+    for study, rows in verdicts.groupby("paper", sort=False):
+        yield f"## {findings(str(study))['title']}\n"
+        of_each = rows[["id", "says", "verdict", "sentence"]].itertuples(index=False)
+        yield from _table(("claim", "what is claimed", "verdict", "what was measured"), of_each)
 
 
 # Figures

@@ -66,11 +66,17 @@ class Winner:
 
     def sentences(self) -> list[str]:
         """The answer: the winner, the margin, what is level, and the test."""
-        said = [f"{self.name} has the smallest error: {self.error_m:.3g} m."]
         level = [str(rival) for rival in self.rivals if not rival.differs]
         behind = [str(rival) for rival in self.rivals if rival.differs]
-        if level:
-            said.append(f"Not significantly worse: {_BETWEEN.join(level)}.")
+        smallest, tested = f"{self.name} has the smallest error", self.n_recordings >= MIN_UNITS
+        if level and tested:
+            said = [
+                f"No single winner: {smallest}, {self.error_m:.3g} m, but not significantly "
+                f"smaller than that of {_BETWEEN.join(level)}."
+            ]
+        else:
+            said = [f"{smallest}: {self.error_m:.3g} m."]
+            said += [f"Behind it, untested: {_BETWEEN.join(level)}."] if level else []
         if behind:
             more = f", and {len(behind) - 1} more" if len(behind) > 1 else ""
             said.append(f"Significantly worse: {behind[0]}{more}.")

@@ -44,8 +44,8 @@ def test_the_winner_its_margin_and_what_is_level():
     assert bad.low < 3.0 < bad.high
     assert paired_p(logs) < 0.025
     words = " ".join(won.sentences())
-    assert "good has the smallest error: 0.01" in words
-    assert "Not significantly worse: level (1.01 [" in words
+    assert "No single winner: good has the smallest error, 0.0103 m" in words
+    assert "not significantly smaller than that of level (1.01 [" in words
     assert "Significantly worse: bad (3 [2.9, 3.1] times its error)." in words
     assert (
         "Paired t tests of the logs of all pairs over 8 recordings, at 5 % in all (Holm)." in words
