@@ -1,7 +1,7 @@
 """Pages of the documentation that are made from the code, by a hook of mkdocs (mkdocs.yml).
 
-Commands, configuration keys, estimators, metrics, claims and the gallery of figures. The pages exist only
-while mkdocs builds the site, so nothing in them is written twice.
+Commands, configuration keys, estimators, metrics, claims and the gallery of figures. The pages
+exist only while mkdocs builds the site, so nothing in them is written twice.
 """
 
 from __future__ import annotations

@@ -320,6 +320,7 @@ def covariances(table: pd.DataFrame) -> Figure:
         ax.set(xlim=(0.4, max(8.0, *ax.get_xlim())))
         low, high = ax.get_xlim()
         plain_ticks(ax, (4.0**i for i in range(-1, 6) if low <= 4.0**i <= high))
+    page.supxlabel("dot: mean over scenes; bar: its 95 % interval", size=9)
     return with_legend(page, ncols=5, loc="outside upper center")
 
 
@@ -381,12 +382,14 @@ def steps(table: pd.DataFrame) -> Figure:
     for ax, level in zip(axes, (0.0, 1.0, 1.0), strict=True):
         ax.axhline(level, color=TRUTH, lw=0.6)
     axes[0].set(xlabel="lag, registrations", ylabel="correlation of errors")
+    told = rows[panels[1][0]].notna().sum()  # recordings that are long enough
+    spans = ("one step", "1 s", "10 s")
     axes[1].set(
         ylim=(0.0, None),
         xlabel="composed over",
         ylabel="NEES / 3",
         xticks=range(3),
-        xticklabels=["one step", "1 s", "10 s"],
+        xticklabels=[f"{span}\n(n = {n})" for span, n in zip(spans, told, strict=True)],
     )
     axes[2].set(
         ylim=(0.0, None),
@@ -396,7 +399,7 @@ def steps(table: pd.DataFrame) -> Figure:
         xticklabels=["position", "heading"],
     )
     page.supxlabel(
-        "dot: median of the recordings; bar: minimum to maximum\n"
+        "dot: median of the n recordings; bar: minimum to maximum\n"
         "line: no correlation; a consistent covariance; an error at the Fisher bound",
         size=9,
     )

@@ -12,7 +12,7 @@ from matplotlib.ticker import LogLocator
 from experiments.judging.results import Results
 from experiments.studies.peers.settings import CLASSES, LASER, MAP, STEREO, TUNED
 from experiments.studies.peers.version import is_ours
-from experiments.viewing.plotting import set_axes
+from experiments.viewing.plotting import plain_log, set_axes
 from experiments.viewing.style import BLUE, ORANGE, WALL, subplots
 
 _BOARDS = [(s, a) for s in (LASER, MAP, STEREO) for a in ("online", "revised")]
@@ -130,6 +130,8 @@ def _draw_log(axes: Axes, part: pd.DataFrame, order: list[str]) -> None:
             x, row["error_m"], mark, ms=5, color=colour, mfc=colour if row["level"] else "white"
         )
     set_axes(axes, yscale="log", xlim=(-0.7, len(order) - 0.3))
+    low, high = axes.get_ylim()
+    plain_log(axes.yaxis, (1.0,) if high > 50.0 * low else (1.0, 2.0, 5.0))
     axes.grid(axis="x", color="0.92")
 
 
