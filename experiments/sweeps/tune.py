@@ -32,7 +32,7 @@ from experiments.evaluation.statistics import Interval, log_ratio_interval
 from experiments.runs import paths
 from experiments.runs.columns import REVISED
 from experiments.runs.compose import compose_options, find_option, searched
-from experiments.runs.console import progress
+from experiments.runs.console import pluralize, progress
 from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
 from experiments.runs.processes import hold_interrupts
@@ -151,8 +151,16 @@ def tune_study(
     trials = merge_into(Path(f"{stem}_trials_tuning.csv"), trials_table(results), order)
     gains = merge_into(Path(f"{stem}_tuning.csv"), gains_table(results), order)
     save_figure(curves(trials, gains), place / "figures" / f"{study}_tuning.png")
-    text = gains.to_string(index=False, float_format=lambda v: f"{v:.4g}")
-    return "\n".join([text, *map(paths.short, written)])
+    return "\n".join([*map(_said, results), *map(paths.short, written)])
+
+
+def _said(tuned: TuningResult) -> str:
+    """The gain of one estimator, in a line."""
+    gain, n = tuned.gain, pluralize(tuned.n_judged, "recording")
+    interval = f" [{gain.low:.3g}, {gain.high:.3g}]" if math.isfinite(gain.low) else ""
+    errors = f"{tuned.default_m:.3g} m by default, {tuned.tuned_m:.3g} m tuned"
+    line = f"{tuned.estimator}: {gain.value:.3g}{interval} times the default's error"
+    return f"{line} on {n} that it was not tuned on ({errors})"
 
 
 def write(tuned: TuningResult, study: str, tuning: Tuning, folder: Path) -> Path:
