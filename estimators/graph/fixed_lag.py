@@ -62,7 +62,7 @@ from sim import se2
 from sim.arrays import Array, Ints
 from sim.compiled import njit
 from sim.errors import require
-from sim.options import Count, NonNegative, options
+from sim.options import Count, NonNegative, Positive, options
 from sim.recording import Frame
 
 _POSE = slice(0, 3)  # rows of the prior's
@@ -85,6 +85,9 @@ class FixedLagOptions(WheelOptions, StereoOptions):
     """W, the images whose poses are estimated together."""
     iterations: Count = 1
     """Gauss-Newton steps at every image."""
+    scaled_beyond: Positive | None = 30.0
+    """Squared residual, in standard deviations, beyond which an observation counts for less, and
+    far beyond it for next to nothing; null: all count alike."""
     keep_landmarks: bool = True
     """Keep landmarks that the window sees no more, so that they count when they come back. If not,
     time and memory do not grow with the map."""
@@ -181,15 +184,20 @@ class FixedLag(FixedLagOptions):
         self._landmarks = np.concatenate([self._landmarks, placed])
         self._images.append(_Image(self._motion, landmarks, points))
         self._motion = STILL
-        sound = all(self._refine() for _ in range(self.iterations))
+        sound = all(self._refine(is_new=i == 0) for i in range(self.iterations))
+        if sound and self._contradicts(self._images[-1]):
+            sound = self._refine(is_new=False)
         if len(self._images) >= self.lag_images:
             sound &= self._absorb(self._images.pop(0))
         return "" if sound else "image not used: broken covariance, not positive definite"
 
-    def _refine(self) -> bool:
-        """One Gauss-Newton step of the window; not taken, with False, if it cannot be solved."""
+    def _refine(self, *, is_new: bool) -> bool:
+        """One Gauss-Newton step of the window; not taken, with False, if it cannot be solved.
+
+        While an image `is_new`, its pose is only where the wheels put it.
+        """
         try:
-            active, step, root = self._solved()
+            active, step, root = self._solved(is_new=is_new)
         except np.linalg.LinAlgError:
             return False
         if not np.isfinite(step).all():
@@ -203,7 +211,7 @@ class FixedLag(FixedLagOptions):
         self._belief = Gaussian(self._poses[-1], root.T @ root)
         return True
 
-    def _solved(self) -> tuple[Ints, Array, Array]:
+    def _solved(self, *, is_new: bool) -> tuple[Ints, Array, Array]:
         """Solve the window's normal equations, of its landmarks and then its poses.
 
         Returns
@@ -243,7 +251,13 @@ class FixedLag(FixedLagOptions):
         counts = [len(image.landmarks) for image in self._images]
         images = np.repeat(np.arange(1, len(counts) + 1), counts)
         points = np.concatenate([image.points for image in self._images])
-        e, by_pose, by_landmark = self._whitened(self._poses[images], seen, points)
+        residuals = self._whitened(self._poses[images], seen, points)
+        squares = np.sum(residuals[0] * residuals[0], axis=1)
+        if is_new:
+            k = counts[-1]
+            again = np.isin(seen[-k:], seen[:-k])  # what the window has not seen may be far off
+            squares[-k:] = again * self._squares_of_newest(residuals[0][-k:], residuals[1][-k:])
+        e, by_pose, by_landmark = self._scaled(residuals, squares)
         _add(H, g, n_landmarks + images, columns, by_pose, by_landmark, e)
 
         factor = _root(flat)
@@ -287,7 +301,8 @@ class FixedLag(FixedLagOptions):
         moved = self._move(image.motion)
         self._poses = self._poses[1:]
         x_1 = np.tile(self._poses[0], (len(image.points), 1))
-        e, by_pose, by_landmark = self._whitened(x_1, image.landmarks, image.points)
+        residuals = self._whitened(x_1, image.landmarks, image.points)
+        e, by_pose, by_landmark = self._scaled(residuals, np.sum(residuals[0] ** 2, axis=1))
         e += by_pose @ moved
         old = image.landmarks < self._n_prior
         taken = self._update(image.landmarks[old], e[old], by_pose[old], by_landmark[old])
@@ -354,6 +369,40 @@ class FixedLag(FixedLagOptions):
         self._images = [replace(i, landmarks=number[i.landmarks]) for i in self._images]
         old = self._landmark_of_id.items()
         self._landmark_of_id = {i: int(number[n]) for i, n in old if kept[n]}
+
+    def _contradicts(self, image: _Image) -> bool:
+        """Whether the newest image, as it is now solved, has observations that count for less."""
+        if self.scaled_beyond is None:
+            return False
+        poses = np.tile(self._poses[-1], (len(image.points), 1))
+        e = self._whitened(poses, image.landmarks, image.points)[0]
+        return bool((np.sum(e * e, axis=1) > self.scaled_beyond).any())
+
+    def _squares_of_newest(self, e: Array, by_pose: Array) -> Array:
+        """Squared residuals (K,) where the wheels have put the newest pose, over their spread.
+
+        The landmarks are taken to be as uncertain as one observation of them.
+        """
+        before, motion = self._poses[-2], self._images[-1].motion.covariance
+        turned = se2.between_jacobians(before[None], self._poses[-1:])[1][0]  # by the newest pose
+        of_pose = inverse(turned) @ motion @ inverse(turned).T
+        spread = by_pose @ of_pose @ transpose(by_pose) + 2.0 * np.eye(3)
+        return np.asarray(np.einsum("ki,ki->k", e, np.linalg.solve(spread, e[..., None])[..., 0]))
+
+    def _scaled(
+        self, residuals: tuple[Array, Array, Array], squares: Array
+    ) -> tuple[Array, Array, Array]:
+        """Whitened residuals and derivatives (K, ...) by dynamic covariance scaling.
+
+        Agarwal et al., Robust map optimization using dynamic covariance scaling, ICRA 2013,
+        eq. (15), with Phi the square at which it begins.
+        """
+        limit = self.scaled_beyond
+        if limit is None or not (squares > limit).any():
+            return residuals
+        scale = np.minimum(1.0, 2.0 * limit / (limit + squares))
+        e, by_pose, by_landmark = residuals
+        return (scale * e.T).T, (scale * by_pose.T).T, (scale * by_landmark.T).T
 
     def _whitened(self, poses: Array, landmarks: Ints, points: Array) -> tuple[Array, Array, Array]:
         """Residuals (K, 3) in standard deviations, and derivatives by the pose and landmark."""

@@ -54,7 +54,8 @@ def test_a_window_beyond_the_run_is_full_least_squares(correlated):
     )
     sensors = {**recording.sensors, "stereo": camera}
     prior = dataclasses.replace(tracking_prior(recording), sensors=sensors)
-    online = follow(FixedLag(**WHEELS, lag_images=1000, iterations=6), recording, prior)
+    alike = FixedLag(**WHEELS, lag_images=1000, iterations=6, scaled_beyond=None)
+    online = follow(alike, recording, prior)
     rows, means, covariances = least_squares_online(recording, prior)
     assert off(online.means[rows], means, covariances) < 0.01
     scale = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
@@ -240,6 +241,24 @@ def test_without_landmarks_it_is_dead_reckoning():
     np.testing.assert_allclose(online.means, alone.means, atol=1e-12)
     np.testing.assert_allclose(online.covariances, alone.covariances, atol=1e-12)
     assert mine.finish().status == "no_landmarks"
+
+
+def test_wild_observations_count_for_next_to_nothing():
+    """One point in twenty lies anywhere before the camera."""
+    recording, rng = circle(3, n_frames=200, kr=1e-4, kl=1e-4), np.random.default_rng(0)
+    points = recording.log("stereo")["points_in_camera"].copy()
+    wild = rng.random(len(points)) < 0.05
+    points[wild] = rng.uniform([0.5, -2.0, -0.5], [8.0, 2.0, 0.5], (wild.sum(), 3))
+    odd, truth = with_field(recording, "stereo", points_in_camera=points), recording.truth.poses
+
+    def error_m(log, **options):
+        off_m = (follow(FixedLag(**WHEELS, **options), log).means - truth)[:, :2]
+        return np.sqrt(np.mean(np.sum(off_m * off_m, axis=1)))
+
+    clean = error_m(recording)
+    assert error_m(recording, scaled_beyond=None) == pytest.approx(clean, rel=0.05)
+    assert error_m(odd) < 2.0 * clean
+    assert error_m(odd, scaled_beyond=None) > 10.0 * clean
 
 
 def test_odd_observations_are_survived():
