@@ -54,6 +54,7 @@ def intel(relations: pd.DataFrame, paths: Arrays) -> Figure:
     right.grid(axis="y", lw=0.4)
     right.set_yticks(range(len(methods)), methods, fontsize=8)
     right.set(xscale="log", xlim=(0.02, 40.0), xlabel="mean translational error of relations, m")
+    plain_log(right.xaxis, (1.0,))
     page.legend(*right.get_legend_handles_labels(), loc="outside lower right", fontsize=7)
     return page
 
@@ -126,7 +127,7 @@ def wheels(found: pd.DataFrame) -> Figure:
 def wean(fits: pd.DataFrame, drawn: Arrays) -> Figure:
     """The map in the reading that fits the scans, with paths and beam ends."""
     right = fits[(fits.one_means == "free") & ~fits.mirrored]
-    page, axes = subplots(5.2 * len(right), 5.6, 1, len(right), squeeze=False)
+    page, axes = subplots(5.2 * len(right), 2.8, 1, len(right), squeeze=False)
     for ax, row in zip(axes[0], right.itertuples(), strict=True):
         ax.imshow(
             np.ma.masked_invalid(drawn["occupancy"].T.astype(float)), origin="lower", cmap="Greys",
@@ -145,4 +146,4 @@ def wean(fits: pd.DataFrame, drawn: Arrays) -> Figure:
             title=f"Wean Hall, log {row.log}: on walls: {row.score:.2f}, "
             f"start heading {math.degrees(row.yaw_rad):.0f}°",
         )
-    return with_legend(page, ncols=2, of=ax, markerscale=6)
+    return with_legend(page, ncols=3, of=ax, markerscale=2.5)
