@@ -51,7 +51,7 @@ from estimators.graph.landmark_drive import (
     read_observations,
     solve_drives,
 )
-from estimators.graph.least_squares import MIN_INFORMATION, OnStep
+from estimators.graph.least_squares import MIN_INFORMATION, LeastSquaresOptions, OnStep, Robust
 from estimators.graph.matrices import inverse, times, transpose, whitening_of
 from estimators.landmarks.joint import JointGaussian, quarter_turned
 from estimators.landmarks.stereo import StereoModel, StereoOptions
@@ -78,16 +78,18 @@ class _Image:
 
 
 @options("estimator")
-class FixedLagOptions(WheelOptions, StereoOptions):
+class FixedLagOptions(WheelOptions, StereoOptions, LeastSquaresOptions):
     """Options of fixed-lag smoothing."""
 
+    robust: Robust = "dcs"
+    """Loss of each observation, in the window and at the end: `none` (squares); `huber`, `cauchy`
+    or `dcs` from `robust_sigma` on."""
+    robust_sigma: Positive = 5.5
+    """Mahalanobis distance at which the loss turns."""
     lag_images: Count = 20
     """W, the images whose poses are estimated together."""
     iterations: Count = 1
     """Gauss-Newton steps at every image."""
-    scaled_beyond: Positive | None = 30.0
-    """Squared residual, in standard deviations, beyond which an observation counts for less, and
-    far beyond it for next to nothing; null: all count alike."""
     keep_landmarks: bool = True
     """Keep landmarks that the window sees no more, so that they count when they come back. If not,
     time and memory do not grow with the map."""
@@ -157,7 +159,7 @@ class FixedLag(FixedLagOptions):
 
         It starts from the online estimate. `on_step` is called before each of its steps.
         """
-        return solve_drives([self._drive], on_step=on_step)[0]
+        return solve_drives([self._drive], self, on_step=on_step)[0]
 
     def _registered(self, frame: Frame) -> Gaussian | None:
         """Motion since the last image by the scans; None without both, or if that fails."""
@@ -257,7 +259,7 @@ class FixedLag(FixedLagOptions):
             k = counts[-1]
             again = np.isin(seen[-k:], seen[:-k])  # what the window has not seen may be far off
             squares[-k:] = again * self._squares_of_newest(residuals[0][-k:], residuals[1][-k:])
-        e, by_pose, by_landmark = self._scaled(residuals, squares)
+        e, by_pose, by_landmark = self._weighted(residuals, squares)
         _add(H, g, n_landmarks + images, columns, by_pose, by_landmark, e)
 
         factor = _root(flat)
@@ -302,7 +304,7 @@ class FixedLag(FixedLagOptions):
         self._poses = self._poses[1:]
         x_1 = np.tile(self._poses[0], (len(image.points), 1))
         residuals = self._whitened(x_1, image.landmarks, image.points)
-        e, by_pose, by_landmark = self._scaled(residuals, np.sum(residuals[0] ** 2, axis=1))
+        e, by_pose, by_landmark = self._weighted(residuals, np.sum(residuals[0] ** 2, axis=1))
         e += by_pose @ moved
         old = image.landmarks < self._n_prior
         taken = self._update(image.landmarks[old], e[old], by_pose[old], by_landmark[old])
@@ -372,11 +374,11 @@ class FixedLag(FixedLagOptions):
 
     def _contradicts(self, image: _Image) -> bool:
         """Whether the newest image, as it is now solved, has observations that count for less."""
-        if self.scaled_beyond is None:
+        if self.robust == "none":
             return False
         poses = np.tile(self._poses[-1], (len(image.points), 1))
         e = self._whitened(poses, image.landmarks, image.points)[0]
-        return bool((np.sum(e * e, axis=1) > self.scaled_beyond).any())
+        return bool((np.sum(e * e, axis=1) > self.robust_sigma**2).any())
 
     def _squares_of_newest(self, e: Array, by_pose: Array) -> Array:
         """Squared residuals (K,) where the wheels have put the newest pose, over their spread.
@@ -389,20 +391,15 @@ class FixedLag(FixedLagOptions):
         spread = by_pose @ of_pose @ transpose(by_pose) + 2.0 * np.eye(3)
         return np.asarray(np.einsum("ki,ki->k", e, np.linalg.solve(spread, e[..., None])[..., 0]))
 
-    def _scaled(
+    def _weighted(
         self, residuals: tuple[Array, Array, Array], squares: Array
     ) -> tuple[Array, Array, Array]:
-        """Whitened residuals and derivatives (K, ...) by dynamic covariance scaling.
-
-        Agarwal et al., Robust map optimization using dynamic covariance scaling, ICRA 2013,
-        eq. (15), with Phi the square at which it begins.
-        """
-        limit = self.scaled_beyond
-        if limit is None or not (squares > limit).any():
+        """Whitened residuals and derivatives (K, ...), weighted by their loss at these squares."""
+        if self.robust == "none":
             return residuals
-        scale = np.minimum(1.0, 2.0 * limit / (limit + squares))
+        root = np.sqrt(self.loss(squares)[1])
         e, by_pose, by_landmark = residuals
-        return (scale * e.T).T, (scale * by_pose.T).T, (scale * by_landmark.T).T
+        return root[:, None] * e, root[:, None, None] * by_pose, root[:, None, None] * by_landmark
 
     def _whitened(self, poses: Array, landmarks: Ints, points: Array) -> tuple[Array, Array, Array]:
         """Residuals (K, 3) in standard deviations, and derivatives by the pose and landmark."""

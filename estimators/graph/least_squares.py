@@ -58,6 +58,20 @@ class LeastSquaresOptions:
     max_iterations: Count = 100
     """Most steps of each of the two stages."""
 
+    def loss(self, squares: Array) -> tuple[Array, Array]:
+        """Loss (K,) of squared Mahalanobis distances, and its derivative by them."""
+        turn = self.robust_sigma**2
+        if self.robust == "huber":
+            beyond = squares > turn
+            root = np.sqrt(np.where(beyond, squares, turn) * turn)
+            return np.where(beyond, 2.0 * root - turn, squares), np.where(beyond, turn / root, 1.0)
+        if self.robust == "cauchy":
+            return turn * np.log1p(squares / turn), 1.0 / (1.0 + squares / turn)
+        if self.robust == "dcs":
+            scale = np.minimum(1.0, 2.0 * turn / (turn + squares))
+            return np.where(scale < 1.0, turn * (3.0 - 2.0 * scale), squares), scale**2
+        return squares, np.ones_like(squares)
+
 
 PLAIN_SQUARES = LeastSquaresOptions()
 
@@ -346,17 +360,17 @@ class _Residuals:
         """Sum of the losses."""
         start, motion = self._of_motions(poses)
         seen = times(whitening, self._of_image(poses, landmarks, in_image)[0])
-        loss, _ = self._loss(np.sum(seen**2, axis=1))
+        loss, _ = self.how.loss(np.sum(seen**2, axis=1))
         if self.problem.sightings is not None:
             sighted = self.problem.sightings.residuals(poses, in_image)[0]
-            loss = np.append(loss, self._loss(np.sum(sighted**2, axis=1))[0])
+            loss = np.append(loss, self.how.loss(np.sum(sighted**2, axis=1))[0])
         return self._cost(start, motion, loss)
 
     def _cost(self, start: Array, motion: Array, loss: Array) -> float:
         """Sum of the losses of the whitened first pose and motions (F, 3), and of the images."""
         doubtful = self.problem.doubtful
         if doubtful is not None:
-            loss = np.append(loss, self._loss(np.sum(motion[doubtful] ** 2, axis=1))[0])
+            loss = np.append(loss, self.how.loss(np.sum(motion[doubtful] ** 2, axis=1))[0])
             motion = motion[~doubtful]
         return float(np.sum(start**2) + np.sum(motion**2) + np.sum(loss))
 
@@ -370,14 +384,14 @@ class _Residuals:
         sums.add([first], [by_start], start[None])
         weights = np.ones(len(motion))
         if p.doubtful is not None:
-            weights[p.doubtful] = self._loss(np.sum(motion[p.doubtful] ** 2, axis=1))[1]
+            weights[p.doubtful] = self.how.loss(np.sum(motion[p.doubtful] ** 2, axis=1))[1]
         by_ends = se2.between_jacobians(poses[p.first], poses[p.second])
         sides = [self._motion_whitening @ side for side in by_ends]
         sums.add([p.first, p.second], sides, motion, weights)
 
         seen, by_pose, by_landmark = self._of_image(poses, landmarks, in_image)
         seen = times(whitening, seen)
-        loss, weight = self._loss(np.sum(seen**2, axis=1))
+        loss, weight = self.how.loss(np.sum(seen**2, axis=1))
         weighted = whitening * np.sqrt(weight)[:, None, None]
         seen = seen * np.sqrt(weight)[:, None]
         by_pose, by_landmark = weighted @ by_pose, weighted @ by_landmark
@@ -385,7 +399,7 @@ class _Residuals:
         sums.add([p.pose_rows], [by_pose], seen)
         if p.sightings is not None:
             sighted, *sides = p.sightings.residuals(poses, in_image)
-            lost, weight = self._loss(np.sum(sighted**2, axis=1))
+            lost, weight = self.how.loss(np.sum(sighted**2, axis=1))
             loss = np.append(loss, lost)
             sums.add([p.sightings.seeing_rows, p.sightings.seen_rows], sides, sighted, weight)
         V = np.tile(MIN_INFORMATION * np.eye(3), (n_landmarks, 1, 1))
@@ -429,17 +443,3 @@ class _Residuals:
             return np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3, 3))
         poses, landmarks = poses[p.pose_rows], landmarks[p.landmark_rows]
         return residuals_of(p.camera, poses, landmarks, p.points_in_camera, in_image)
-
-    def _loss(self, squares: Array) -> tuple[Array, Array]:
-        """Loss (K,) of squared Mahalanobis distances, and its derivative by them."""
-        turn = self.how.robust_sigma**2
-        if self.how.robust == "huber":
-            beyond = squares > turn
-            root = np.sqrt(np.where(beyond, squares, turn) * turn)
-            return np.where(beyond, 2.0 * root - turn, squares), np.where(beyond, turn / root, 1.0)
-        if self.how.robust == "cauchy":
-            return turn * np.log1p(squares / turn), 1.0 / (1.0 + squares / turn)
-        if self.how.robust == "dcs":
-            scale = np.minimum(1.0, 2.0 * turn / (turn + squares))
-            return np.where(scale < 1.0, turn * (3.0 - 2.0 * scale), squares), scale**2
-        return squares, np.ones_like(squares)
