@@ -21,6 +21,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from experiments.cli.main import app  # noqa: E402
+from experiments.judging.claim import Verdict  # noqa: E402
 from experiments.judging.folders import ROOMS, findings  # noqa: E402
 from experiments.judging.results import reproduce_command  # noqa: E402
 from experiments.report.contents import OWN  # noqa: E402
@@ -249,7 +250,8 @@ def _claims() -> Iterator[str]:
     verdicts = pd.read_csv(ROOT / "results" / "verdicts.csv", keep_default_na=False)
     for study, rows in verdicts.groupby("paper", sort=False):
         yield f"## {findings(str(study))['title']}\n"
-        of_each = rows[["id", "says", "verdict", "sentence"]].itertuples(index=False)
+        named = rows.assign(verdict=[Verdict(verdict).label for verdict in rows["verdict"]])
+        of_each = named[["id", "says", "verdict", "sentence"]].itertuples(index=False)
         yield from _table(("claim", "what is claimed", "verdict", "what was measured"), of_each)
 
 

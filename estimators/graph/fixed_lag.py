@@ -26,6 +26,11 @@ disagree on what a turn of the whole map does, its heading seems known (huang200
 by a sixth over drives of 40 m. A Bayes tree (kaess2012, iSAM2) linearises old poses again instead,
 where they have moved.
 
+Observations are weighted by a robust loss, since a few wrong ones would carry the window away. An
+image is first weighted where the wheels have put it, with the spread of its motion allowed for;
+landmarks that the window does not see otherwise count in full there, since the pose may be far off
+by them. If an observation still contradicts the solution, a second step weights it down.
+
 With a laser, the scans of consecutive images are registered, and their relative pose is one more
 measurement of u_i, of the covariance that `estimators.laser.scan_matching` gives it.
 

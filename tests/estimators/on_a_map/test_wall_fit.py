@@ -50,7 +50,7 @@ def squared(fitted, pose):
 
 
 def test_the_pose_is_that_of_scipy():
-    """The pose and biases of maximum likelihood by the ranges themselves, cast anew for each."""
+    """The pose and biases of maximum likelihood by the ranges themselves, cast again for each."""
     rng = np.random.default_rng(0)
     off = []
     for _ in range(10):
@@ -94,7 +94,7 @@ def test_it_knows_its_error(planted):
 
 
 def learns_what_another_does_not(learning, alone, most_m):
-    """Beside a fitter that starts anew, or forgets, of a laser that errs by 15 mm."""
+    """Beside a fitter that starts over, or forgets, of a laser that errs by 15 mm."""
     rng, found = np.random.default_rng(2), []
     for _ in range(20):
         pose, start = somewhere(rng)
