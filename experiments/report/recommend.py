@@ -148,8 +148,8 @@ def _candidates(
         on_progress(_COMPOSED * number / len(options))
         asked = [*overrides, f"estimator={option}"]
         experiment = Experiment(*composer.compose(asked).resolve())
-        if experiment.config["estimator"].get("command", option) is None:
-            continue  # a program of the user's, and none is named
+        if experiment.lacks_program:
+            continue
         missing = experiment.missing()
         try:
             if not missing:

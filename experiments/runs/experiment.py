@@ -224,6 +224,11 @@ class Experiment(Objects):
         names = [settings.get(o, o) for need in self._needs_stated() for o in need.split("|")]
         return sorted(name for name in names if has.get(name) is not None)
 
+    @property
+    def lacks_program(self) -> bool:
+        """Whether the estimator is a program of the user's, and none is named."""
+        return bool(self.config["estimator"].get("command", self.estimator_name) is None)
+
     def missing(self) -> list[str]:
         """What the estimator needs and does not get, in words."""
         needs, settings = self._needs_stated(), self.config["estimator"]
