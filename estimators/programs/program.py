@@ -32,7 +32,8 @@ from sim.worlds.world import World
 
 Seconds = Annotated[float, Field(gt=0.0, le=1e6)]  # the longest that something may take
 
-PEERS_PROGRAM = "build/peers/mrpt"  # of the estimators mrpt_*
+MRPT_PROGRAM, AMCL_PROGRAM = "build/peers/mrpt", "build/peers/amcl"
+_COMPILED = {MRPT_PROGRAM: "make peers", AMCL_PROGRAM: "make peers NAV2=FOLDER"}  # by what
 _TAIL = 2000  # bytes of its messages that are kept
 _CHUNK = 1 << 16
 _PATIENCE_S = 2.0  # to end by itself once its input is closed
@@ -54,7 +55,8 @@ class ProgramOptions:
 
     def __post_init__(self) -> None:
         if shutil.which(name := self.words[0]) is None:
-            remedy = "`make peers` compiles it" if name == PEERS_PROGRAM else "give its path"
+            how = _COMPILED.get(name)
+            remedy = f"`{how}` compiles it" if how else "give its path"
             raise MissingPackageError(
                 f"estimator.command: no program {name} that can be run; {remedy}"
             )

@@ -9,12 +9,13 @@ import pytest
 from estimators.base import run
 from estimators.graph.fixed_lag import FixedLag
 from estimators.graph.smoother import Smoother
-from estimators.peers import MissingPackageError, matrix_of, pose_of
+from estimators.peers import MissingPackageError, filterpy_ekf, matrix_of, pose_of
+from estimators.peers.filterpy_ekf import FilterpyEkf
 from estimators.peers.gtsam_batch import GtsamBatch
 from estimators.peers.gtsam_isam2 import GtsamIsam2
 from estimators.peers.kiss_icp import KissIcp
 from estimators.peers.small_gicp import SmallGicp
-from estimators.programs.program import PEERS_PROGRAM
+from estimators.programs.program import AMCL_PROGRAM, MRPT_PROGRAM
 from experiments.runs.evaluate import evaluate
 from experiments.runs.experiment import Experiment
 from sim import se2
@@ -22,6 +23,7 @@ from sim.errors import InputError
 from tests.fixtures.fakes import circle, tracking_prior
 
 PACKAGES = {
+    "filterpy.kalman": (FilterpyEkf,),
     "gtsam": (GtsamBatch, GtsamIsam2),
     "kiss_icp.config": (KissIcp,),
     "small_gicp": (SmallGicp,),
@@ -81,6 +83,21 @@ def test_isam2_ends_where_the_smoother_does():
     assert theirs == pytest.approx(np.sqrt(np.diag(ours.covariances[last])), rel=0.1)
 
 
+def test_filterpy_follows_and_its_derivative_is_right():
+    pytest.importorskip("filterpy")
+    recording = circle(4, n_frames=120, kr=1e-4, kl=1e-4)
+    ours, theirs = driven(FixedLag(), recording), driven(FilterpyEkf(), recording)
+    sigma = np.sqrt(ours.covariances[:, [0, 1, 2], [0, 1, 2]])
+    assert np.abs((ours.means - theirs.means) / sigma).max() < 1.0
+    x, at, step = np.random.default_rng(0).normal(size=9), np.array([5, 3, 7]), 1e-6
+    by_differences = [
+        (filterpy_ekf._expected(x + d, at) - filterpy_ekf._expected(x - d, at)) / (2.0 * step)
+        for d in step * np.eye(len(x))
+    ]
+    found = filterpy_ekf._jacobian(x, at)
+    np.testing.assert_allclose(found, np.transpose(by_differences), atol=1e-8)
+
+
 def test_a_camera_whose_noise_gtsam_does_not_have_is_refused():
     pytest.importorskip("gtsam")
     recording = circle(n_frames=3)
@@ -111,17 +128,20 @@ def test_kiss_icp_follows_a_circle(guess):
     assert off_m(recording, estimate.means).max() < 0.15
 
 
-@pytest.mark.skipif(not Path(PEERS_PROGRAM).exists(), reason="`make peers` compiles it")
 @pytest.mark.parametrize(
-    ("option", "most_m"), [("mrpt_icp", 0.018), ("mrpt_mcl", 0.06), ("mrpt_rbpf", 0.2)]
+    ("option", "most_m"),
+    [("mrpt_icp", 0.018), ("mrpt_mcl", 0.06), ("mrpt_rbpf", 0.2), ("nav2_amcl", 0.12)],
 )
-def test_mrpt_follows_exact_wheels_and_ranges(option, most_m):
+def test_programs_follow_exact_wheels_and_ranges(option, most_m):
     """With a turned laser off the centre.
 
     Without its mount's turn `mrpt_icp` misses by 2.3 m, without its place by 0.15 m, with a field
-    of view that is one beam too wide by 0.022 m. What is left is MRPT's own: it takes the wheels
-    to err by a centimetre between scans.
+    of view that is one beam too wide by 0.022 m. What is left is their own: MRPT takes the wheels
+    to err by a centimetre between scans, and AMCL by 0.45 of every turn.
     """
+    program = AMCL_PROGRAM if option == "nav2_amcl" else MRPT_PROGRAM
+    if not Path(program).exists():
+        pytest.skip(f"{program} is not compiled; see `make help`")
     settings = ["world=room", "sensors=hokuyo", "sensors.laser.n_beams=361"]
     settings += ["sensors.laser.mount.x_m=0.3", "sensors.laser.mount.yaw_rad=0.7"]
     settings += ["sensors.laser.max_range_m=20", "sensors.laser.sigma_range_m=1e-4"]

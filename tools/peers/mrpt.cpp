@@ -27,90 +27,39 @@
 #include <mrpt/slam/CMonteCarloLocalization2D.h>
 #include <mrpt/version.h>
 
-#include <cmath>
-#include <cstdio>
 #include <cstdlib>
 #include <fstream>
 #include <iostream>
-#include <sstream>
 #include <string>
 #include <vector>
+
+#include "carmen_log.hpp"
 
 using mrpt::poses::CPose2D;
 using mrpt::poses::CPosePDFGaussian;
 
-struct Scan {
-  double stamp;
-  CPose2D odometry;
-  mrpt::obs::CObservation2DRangeScan::Ptr observation;
-};
-
-[[noreturn]] void fail(const std::string& why) {
-  std::cerr << why << "\n";
-  std::exit(1);
-}
-
-std::vector<Scan> read_log(const std::string& path) {
-  std::ifstream file(path);
-  if (!file) fail(path + ": cannot read it");
-  std::vector<Scan> scans;
-  std::string line;
-  while (std::getline(file, line)) {
-    std::istringstream words(line);
-    std::string kind;
-    words >> kind;
-    if (kind != "ROBOTLASER1") continue;
-    double type, start, fov, step, max_range, accuracy, remission;
-    std::size_t n = 0;
-    words >> type >> start >> fov >> step >> max_range >> accuracy >> remission >> n;
-    auto scan = mrpt::obs::CObservation2DRangeScan::Create();
-    scan->aperture = static_cast<float>(step * (n - 1));
-    scan->rightToLeft = true;
-    scan->maxRange = static_cast<float>(max_range);
-    scan->stdError = static_cast<float>(accuracy);
-    scan->resizeScan(n);
-    for (std::size_t i = 0; i < n; ++i) {
-      double range = 0.0;
-      words >> range;
-      const bool seen = range > 0.0 && range < max_range;
-      scan->setScanRange(i, static_cast<float>(seen ? range : 0.0));
-      scan->setScanRangeValidity(i, seen);
-    }
-    double n_remissions, lx, ly, la, x, y, a, rest, stamp;
-    words >> n_remissions >> lx >> ly >> la >> x >> y >> a;
-    for (int i = 0; i < 5; ++i) words >> rest;
-    words >> stamp;
-    if (!words) fail(path + ": a ROBOTLASER1 line is cut short");
-    const CPose2D robot(x, y, a);
-    const CPose2D mount = CPose2D(lx, ly, la) - robot;
-    scan->sensorPose =
-        mrpt::poses::CPose3D(mount.x(), mount.y(), 0.25, mount.phi() + start + scan->aperture / 2);
-    scan->timestamp = mrpt::Clock::fromDouble(stamp);
-    scan->sensorLabel = "laser";
-    scans.push_back({stamp, robot, scan});
+// A scan as MRPT has it; its beams without a return are invalid.
+mrpt::obs::CObservation2DRangeScan::Ptr observed(const Scan& scan) {
+  auto seen = mrpt::obs::CObservation2DRangeScan::Create();
+  const std::size_t n = scan.ranges_m.size();
+  seen->aperture = static_cast<float>(scan.step_rad * (n - 1));
+  seen->rightToLeft = true;
+  seen->maxRange = static_cast<float>(scan.max_range_m);
+  seen->stdError = static_cast<float>(scan.sigma_m);
+  seen->resizeScan(n);
+  for (std::size_t i = 0; i < n; ++i) {
+    seen->setScanRange(i, static_cast<float>(scan.seen(i) ? scan.ranges_m[i] : 0.0));
+    seen->setScanRangeValidity(i, scan.seen(i));
   }
-  if (scans.empty()) fail(path + ": no ROBOTLASER1 lines");
-  return scans;
+  seen->sensorPose = mrpt::poses::CPose3D(scan.mount.x, scan.mount.y, 0.25,
+                                          scan.mount.heading + scan.first_rad + seen->aperture / 2);
+  seen->timestamp = mrpt::Clock::fromDouble(scan.stamp);
+  seen->sensorLabel = "laser";
+  return seen;
 }
 
-// Whether the file holds a start: x y heading, and the rows of its covariance.
-bool read_start(const std::string& path, CPosePDFGaussian& start) {
-  std::ifstream file(path);
-  double x, y, heading;
-  if (!(file >> x >> y >> heading)) return false;
-  start.mean = CPose2D(x, y, heading);
-  for (int row = 0; row < 3; ++row)
-    for (int column = 0; column < 3; ++column)
-      if (!(file >> start.cov(row, column))) fail(path + ": the covariance is cut short");
-  return true;
-}
-
-void write_pose(std::ofstream& out, double stamp, const CPose2D& pose) {
-  char line[200];
-  std::snprintf(line, sizeof line, "%.9f %.17g %.17g 0 0 0 %.17g %.17g", stamp, pose.x(), pose.y(),
-                std::sin(pose.phi() / 2), std::cos(pose.phi() / 2));
-  out << line;
-}
+CPose2D mrpt_pose(const Pose& pose) { return {pose.x, pose.y, pose.heading}; }
+Pose plain(const CPose2D& pose) { return {pose.x(), pose.y(), pose.phi()}; }
 
 // icp-slam/icp-slam_demo_classic.ini
 const char* const ICP = R"(
@@ -233,8 +182,8 @@ mrpt::obs::CActionCollection moved_between(
     const Scan& before, const Scan& now,
     const mrpt::obs::CActionRobotMovement2D::TMotionModelOptions& noise) {
   mrpt::obs::CActionRobotMovement2D moved;
-  moved.computeFromOdometry(now.odometry - before.odometry, noise);
-  moved.timestamp = now.observation->timestamp;
+  moved.computeFromOdometry(mrpt_pose(now.odometry) - mrpt_pose(before.odometry), noise);
+  moved.timestamp = mrpt::Clock::fromDouble(now.stamp);
   mrpt::obs::CActionCollection actions;
   actions.insert(moved);
   return actions;
@@ -247,10 +196,10 @@ void build_map(Builder& builder, const std::vector<Scan>& scans, const CPose2D& 
   for (std::size_t i = 0; i < scans.size(); ++i) {
     auto actions = moved_between(scans[i ? i - 1 : 0], scans[i], {});
     mrpt::obs::CSensoryFrame frame;
-    frame.insert(scans[i].observation);
+    frame.insert(observed(scans[i]));
     builder.processActionObservation(actions, frame);
     const CPose2D believed(builder.getCurrentPoseEstimation()->getMeanVal());
-    write_pose(out, scans[i].stamp, start + believed);
+    write_pose(out, scans[i].stamp, plain(start + believed));
     out << "\n";
   }
 }
@@ -301,16 +250,11 @@ void run_mcl(const std::vector<Scan>& scans, const CPosePDFGaussian* start, std:
   for (std::size_t i = 0; i < scans.size(); ++i) {
     const auto actions = moved_between(scans[i ? i - 1 : 0], scans[i], noise);
     mrpt::obs::CSensoryFrame frame;
-    frame.insert(scans[i].observation);
+    frame.insert(observed(scans[i]));
     if (i > 0 || !start) filter.executeOn(particles, &actions, &frame);
     const auto [covariance, mean] = particles.getCovarianceAndMean();
-    write_pose(out, scans[i].stamp, mean);
-    char number[30];
-    for (int row = 0; row < 3; ++row)
-      for (int column = row; column < 3; ++column) {
-        std::snprintf(number, sizeof number, " %.17g", covariance(row, column));
-        out << number;
-      }
+    write_pose(out, scans[i].stamp, plain(mean));
+    write_covariance(out, covariance);
     out << "\n";
   }
 }
@@ -326,8 +270,12 @@ int main(int argc, char** argv) {
   const int first_option = mcl ? 7 : 6;
   if (argc < first_option) fail("usage: mrpt icp|mcl|rbpf LOG START OUT SEED [GRID] [KEY=VALUE ...]");
   const std::vector<Scan> scans = read_log(argv[2]);
-  CPosePDFGaussian start;
-  const bool known = read_start(argv[3], start);
+  Pose mean;
+  double covariance[3][3];
+  const bool known = read_start(argv[3], mean, covariance);
+  CPosePDFGaussian start(mrpt_pose(mean));
+  for (int row = 0; known && row < 3; ++row)
+    for (int column = 0; column < 3; ++column) start.cov(row, column) = covariance[row][column];
   if (!known && !mcl) fail("the start is not known; set prior.start=tracking");
   std::ofstream out(argv[4]);
   mrpt::random::getRandomGenerator().randomize(

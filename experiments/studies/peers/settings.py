@@ -11,17 +11,21 @@ PACKAGES = {
     "kiss_icp_wheels": "kiss-icp",
     "gtsam_isam2": "gtsam",
     "gtsam_batch": "gtsam",
+    "filterpy_ekf": "filterpy",
     "karto": "karto-scanmatcher",
     "mrpt_icp": "mrpt",
     "mrpt_mcl": "mrpt",
     "mrpt_rbpf": "mrpt",
+    "nav2_amcl": "nav2",
 }
 LASER, MAP, STEREO, WHEELS = "laser", "laser, known map", "landmarks", "wheels"
 # What a method reads beside the wheels, where that is not the laser alone.
 READS = {
     "odometry": WHEELS,
-    **dict.fromkeys(("mcl", "mrpt_mcl"), MAP),
-    **dict.fromkeys(("ekf_slam", "fixed_lag", "smoother", "gtsam_isam2", "gtsam_batch"), STEREO),
+    **dict.fromkeys(("mcl", "mrpt_mcl", "nav2_amcl"), MAP),
+    **dict.fromkeys(
+        ("ekf_slam", "fixed_lag", "smoother", "filterpy_ekf", "gtsam_isam2", "gtsam_batch"), STEREO
+    ),
 }
 
 # Real logs: robots of MRCLAM on which no option was chosen; starts in Wean Hall's map (m, m, rad),

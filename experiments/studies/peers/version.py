@@ -3,7 +3,10 @@
 import importlib.metadata
 import subprocess
 
+from estimators.programs.program import AMCL_PROGRAM, MRPT_PROGRAM
 from experiments.studies.peers.settings import LASER, PACKAGES, READS, TUNED
+
+_PROGRAMS = {"mrpt": MRPT_PROGRAM, "nav2": AMCL_PROGRAM}  # whose version only they know
 
 
 def sensor_of(name: str) -> str:
@@ -21,9 +24,9 @@ def version_of(name: str) -> str:
     if is_ours(name):
         return "Estima"
     package = PACKAGES[name.removesuffix(TUNED)]
-    if package == "mrpt":
+    if package in _PROGRAMS:
         said = subprocess.run(
-            ["build/peers/mrpt", "version"], capture_output=True, text=True, check=False, timeout=10
+            [_PROGRAMS[package], "version"], capture_output=True, text=True, check=False, timeout=10
         )
         return said.stdout.strip() or package
     return f"{package} {importlib.metadata.version(package)}"
