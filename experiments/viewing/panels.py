@@ -14,9 +14,15 @@ _MARGIN = 4.0  # pixels around a part
 _HEADER = 33  # bytes of a PNG before its second chunk
 
 
-def note_panels(png: Path, page: Figure, scale: float) -> None:
-    """Add the panels of a figure to its PNG, which has `scale` pixels for one of the figure's."""
-    text = panels(page, scale)
+def note_panels(png: Path, page: Figure, dpi: float) -> None:
+    """Add the panels of a figure to its PNG, which has so many dots per inch."""
+    own = page.dpi
+    try:
+        page.set_dpi(dpi)
+        page.draw_without_rendering()  # letters, and so legends, do not scale as the rest does
+        text = panels(page)
+    finally:
+        page.set_dpi(own)
     if text:
         data = png.read_bytes()
         chunk = b"tEXt" + f"{_KEY}\0{text}".encode("ascii")
@@ -30,16 +36,11 @@ def read_panels(image: Image.Image) -> str:
     return text if isinstance(text, str) else ""
 
 
-def panels(page: Figure, scale: float = 1.0) -> str:
+def panels(page: Figure) -> str:
     """Parts of a drawn figure that can stand alone, as they are read; empty if there is only one.
 
     A part is a panel with all that is written around it; panels that share a horizontal axis are
     one part. Titles and the entries of legends that belong to several panels are parts too.
-
-    Parameters
-    ----------
-    scale
-        Pixels of the picture for one of the figure's.
 
     Returns
     -------
@@ -66,7 +67,7 @@ def panels(page: Figure, scale: float = 1.0) -> str:
         boxes = [box]
         left = [ax for ax in _labelled(host, "y") if ax in parts]
         if left and host not in left:
-            labels, axis = parts[left[0]], left[0].bbox.x0 - (_MARGIN + 1.0) / scale
+            labels, axis = parts[left[0]], left[0].bbox.x0 - (_MARGIN + 1.0)
             boxes = [Bbox.from_extents(labels.x0, box.y0, axis, box.y1), box]
         found.append((-round(host.bbox.y1 / 10.0), box.x0, boxes))
     texts = [text for text in page.texts if text.get_text()]
@@ -80,7 +81,7 @@ def panels(page: Figure, scale: float = 1.0) -> str:
         if box.width > 1.0:
             found.append((-round(box.y1 / 10.0), box.x0, [box]))
     height = page.bbox.height
-    return " ".join("+".join(_pixels(box, height, scale) for box in boxes) for *_, boxes in
+    return " ".join("+".join(_pixels(box, height) for box in boxes) for *_, boxes in
                     sorted(found, key=lambda part: part[:2]))  # fmt: skip
 
 
@@ -103,8 +104,8 @@ def _labelled(ax: Axes, name: str) -> list[Axes]:
     ]
 
 
-def _pixels(box: Bbox, height: float, scale: float) -> str:
+def _pixels(box: Bbox, height: float) -> str:
     """A box with a margin, pixels from the top left corner."""
-    left, right = box.x0 * scale - _MARGIN, box.x1 * scale + _MARGIN
-    top, bottom = (height - box.y1) * scale - _MARGIN, (height - box.y0) * scale + _MARGIN
+    left, right = box.x0 - _MARGIN, box.x1 + _MARGIN
+    top, bottom = height - box.y1 - _MARGIN, height - box.y0 + _MARGIN
     return ",".join(str(max(0, round(end))) for end in (left, top, right, bottom))

@@ -102,7 +102,7 @@ def save_figure(page: Figure, path: Path) -> None:
     with write_whole(path) as part:
         page.savefig(part, dpi=_DPI, metadata=metadata)
         if path.suffix == ".png":
-            note_panels(part, page, _DPI / page.dpi)
+            note_panels(part, page, _DPI)
 
 
 _SUFFIXES = (".png", ".pdf", ".svg")

@@ -47,6 +47,7 @@ def errors(methods: pd.DataFrame) -> Figure:
         gridspec_kw={"height_ratios": heights},
         squeeze=False,
         sharex=True,
+        sharey="row",
     )
     errors_m = able[[f"ate_rmse_m{place}" for place in _PLACES.values()]]
     limits = (errors_m.min(axis=None) / 3.0, errors_m.max(axis=None) * 3.0)
@@ -69,7 +70,6 @@ def errors(methods: pd.DataFrame) -> Figure:
             axes.tick_params(axis="x", labelsize=7)
             axes.grid(axis="y", color="0.92")
             axes.tick_params(axis="y", length=0)
-            axes.set_yticks(at, [""] * len(part))
         line[0].set_yticks(at, [_label(row) for _, row in part.iterrows()], fontsize=7)
         line[0].set_ylabel(f"{board[0]},\n{board[1]}", fontsize=8)
     for axes in rows[-1]:

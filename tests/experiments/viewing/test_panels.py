@@ -55,11 +55,20 @@ def test_panels_stand_alone_as_they_are_read(parts):
     assert boxes.min() >= 0
 
 
-def test_a_legend_of_several_panels_is_parts_of_its_own(parts):
+def test_a_legend_of_several_panels_is_parts_of_its_own(parts, tmp_path):
     page, _ = drawn(1, 2)
     found, held = parts(with_legend(page, ncols=2))
     assert held == [[0], [1], [], []]
     assert all(bottom - top < 50 for ((_, top, _, bottom),) in found[2:])
+    with Image.open(tmp_path / "page.png") as image:
+        inked = np.asarray(image.convert("L")) < 200
+    boxed = np.zeros_like(inked)
+    for (box,) in found[2:]:
+        left, top, right, bottom = box
+        boxed[top:bottom, left:right] = True
+    below = max(bottom for ((_, _, _, bottom),) in found[:2])
+    assert inked[below:].any()
+    assert not (inked & ~boxed)[below:].any()
 
 
 @pytest.mark.parametrize(
