@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 from pydantic import NonNegativeInt
 
-from sim.arrays import Array, Ints
+from sim.arrays import Array, Bools, Ints
 from sim.compiled import njit
 from sim.errors import require
 from sim.options import Positive, options
@@ -27,6 +27,8 @@ _LOOK_S = 0.7  # how far ahead a step is judged
 _STUCK_STEPS, _STUCK_M = 75, 0.3  # in so many steps less far than that: another place is sought
 _KEPT_OFF_M, _KEPT_OFF_AT_REST_M = 0.1, 0.02  # from a robot, beyond what it needs to stop
 _AT_REST_MPS = 0.01
+_PATIENCE_STEPS, _ASIDE_STEPS = 500, 150  # of a robot that stands; people step aside for so long
+_ASIDE_M = 1.0  # from a robot, of those who do
 _PRESSED_M = 0.2  # gap to a robot below which people squeeze past one another
 _FIRST_M = 1.0  # between people, and from robots, at the start
 _PLACES_PER_M2 = 0.1  # places to walk to
@@ -113,6 +115,8 @@ class Crowd:
         self._states = [np.column_stack([first, headings, walked])]  # (n, 4) at each decision
         self._way = [np.zeros((0, 2)) for _ in range(people.n)]
         self._stuck, self._marked = np.zeros(people.n, bool), first
+        self._stood = np.zeros(len(robots), np.int64)  # steps for which a robot has stood
+        self._asked = np.zeros(len(robots), np.int64)  # and those for which people step aside
 
     def _starts(self, cells: Ints) -> Array:
         """First places (n, 2), clear of robots and of each other."""
@@ -146,14 +150,21 @@ class Crowd:
         targets = np.array(
             [self._target(person, state[person, :2]) for person in range(len(state))]
         )
+        self._stood = np.where(speeds > _AT_REST_MPS, 0, self._stood + 1)
+        self._asked = np.where(self._stood >= _PATIENCE_STEPS, _ASIDE_STEPS, self._asked - 1)
+        clear_m = np.full(len(state), radius_m)  # that each keeps from walls
+        for robot in np.flatnonzero(self._asked > 0).tolist():
+            asked = self._step_aside(state[:, :2], poses[robot], self._reach_m[robot], targets)
+            # the cells know a clearance to two diagonals, and keep it by one of them at least
+            clear_m[asked] = self.people.torso_radius_m - math.sqrt(2.0) * self._ground.cell_m
         ground = self._ground
         if len(self._states) % _STUCK_STEPS == 0:
             self._stuck = np.hypot(*(state[:, :2] - self._marked).T) < _STUCK_M
             self._marked = state[:, :2].copy()
         _walk(
             state, targets, self._speeds, obstacles,
-            (ground.clear_m, ground.corner_m[0], ground.corner_m[1], ground.cell_m), radius_m,
-            self.people.torso_radius_m,
+            (ground.clear_m, ground.corner_m[0], ground.corner_m[1], ground.cell_m), clear_m,
+            radius_m, self.people.torso_radius_m,
         )  # fmt: skip
         self._states.append(state)
 
@@ -172,6 +183,17 @@ class Crowd:
             self._stuck[person] = False
         self._way[person] = way
         return _ahead(way) if len(way) else at
+
+    def _step_aside(self, at: Array, pose: Array, reach_m: float, targets: Array) -> Bools:
+        """Let those ahead of a robot, which waits at a pose (3,), walk to its sides: who (n,)."""
+        cos, sin = math.cos(pose[2]), math.sin(pose[2])
+        axes = np.array([[cos, sin], [-sin, cos]])  # rows are the robot's, in map
+        in_base = (at - pose[:2]) @ axes.T
+        gaps = np.hypot(*in_base.T) - reach_m - self.people.radius_m
+        asked: Bools = (in_base[:, 0] > 0.0) & (gaps < _ASIDE_M)
+        side = np.where(in_base[:, 1] < 0.0, -1.0, 1.0)
+        targets[asked] = (at + side[:, None] * axes[1])[asked]
+        return asked
 
     def _lead(self, ways: Ways, at: Array) -> float:
         """How much shorter the way to a place is from a point (2,) than from the nearest robot."""
@@ -298,6 +320,7 @@ def _walk(
     speeds: Array,
     obstacles: Array,
     field: tuple[Array, float, float, float],
+    clear_m: Array,
     radius_m: float,
     torso_m: float,
 ) -> None:
@@ -310,6 +333,7 @@ def _walk(
     for i in range(len(states)):
         x, y = states[i, 0], states[i, 1]
         gap, apart = _robot_gap(obstacles, x, y, radius_m), _person_gap(states, i, x, y, radius_m)
+        keep_m = min(clear_m[i], _clear(field, x, y))
         wanted = math.atan2(targets[i, 1] - y, targets[i, 0] - x)
         step_m, best, turn = speeds[i] * STEP_S, -0.4, np.nan
         if math.hypot(targets[i, 0] - x, targets[i, 1] - y) < 1e-6:
@@ -321,7 +345,7 @@ def _walk(
             nx, ny = x + step_m * cos, y + step_m * sin
             there = _robot_gap(obstacles, nx, ny, radius_m)
             beside = _person_gap(states, i, nx, ny, torso_m)
-            if _clear(field, nx, ny) < radius_m or (there < 0.0 and there <= gap):
+            if _clear(field, nx, ny) < keep_m or (there < 0.0 and there <= gap):
                 continue
             if beside < 0.0 and beside <= apart and gap > _PRESSED_M:
                 continue
