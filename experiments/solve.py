@@ -29,11 +29,17 @@ from experiments.calibration.files import residual_figure
 from experiments.calibration.from_log import LogCalibration, calibrate_log, moved_base
 from experiments.calibration.log_check import check_calibration, check_clocks
 from experiments.calibration.reference import names_of
-from experiments.evaluation.metrics import SCORED_EXTRAS, path_scores, travelled_m, unused_share
+from experiments.evaluation.metrics import (
+    LONGEST_GAP_S,
+    SCORED_EXTRAS,
+    path_scores,
+    travelled_m,
+    unused_share,
+)
 from experiments.evaluation.relations import relation_scores
 from experiments.report.page import render
 from experiments.runs.calibration import write_calibration
-from experiments.runs.console import progress, read_log, show
+from experiments.runs.console import pluralize, progress, read_log, show
 from experiments.runs.evaluate import WARNED_SHARE, run_over, status_of
 from experiments.runs.experiment import Experiment
 from experiments.runs.processes import hold_interrupts
@@ -279,11 +285,12 @@ def scores_of(solved: Solved, relations: Relations | None) -> Row:
                 found = relation_scores(recording, relations, one.stamps, one.means)
                 row |= {f"{prefix}{key}": value for key, value in found.items()}
     if recording.truth is not None:
-        truth = recording.truth_at(path.stamps)
+        truth = recording.truth_at(path.stamps, LONGEST_GAP_S)
         known = np.isfinite(truth).all(axis=1)
         if known.sum() >= 3:
             scores = path_scores(truth[known], path.means[known], path.covariances[known])
             row |= {k: v for k, v in scores.items() if "aligned" in k or k.startswith("rpe")}
+            row["stamps_scored"] = int(known.sum())
     return row
 
 
@@ -372,7 +379,8 @@ def as_text(row: Mapping[str, Any], out: Path) -> str:
             f"{np.degrees(row['relation_rotation_rad']):.3f} degrees in the mean"
         )
     if "ate_aligned_rmse_m" in row:
-        lines.append(f"truth       {row['ate_aligned_rmse_m']:.4f} m RMS, aligned")
+        scored = pluralize(row["stamps_scored"], "pose")
+        lines.append(f"truth       {row['ate_aligned_rmse_m']:.4f} m RMS, aligned, over {scored}")
     elif "n_relations" not in row:
         lines.append(
             "no error    the log has no true path; give relations, or add a path from a file by "

@@ -113,7 +113,7 @@ def main() -> None:
     if stamped == state:
         return
     uv, env = pinned_uv(), environment()
-    print("set-up: making .venv (Python 3.11) from requirements.lock, one to two min", flush=True)
+    print("set-up: making .venv (Python 3.11) from requirements.lock, two to four min", flush=True)
     if not (VENV / "bin" / "python").exists():
         run([uv, "venv", "--quiet", "--clear", "--python", "3.11", str(VENV)], env)
     env["VIRTUAL_ENV"] = str(VENV)

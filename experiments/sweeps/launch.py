@@ -113,6 +113,10 @@ def sweep(
             raise KeyboardInterrupt(
                 f"interrupted; {n_kept} of {len(keys)} runs are kept: run it again to go on"
             ) from None
+        except Exception:
+            if not np.isin(keys, store.ended(folder).done).any():
+                unfinished.unlink(missing_ok=True)  # the command itself is wrong
+            raise
         _tidy(folder)
     unfinished.unlink(missing_ok=True)
     every, found = np.concatenate(wanted), store.ended(folder)

@@ -41,7 +41,12 @@ class Rival:
 
     def __str__(self) -> str:
         interval = f" [{self.low:.3g}, {self.high:.3g}]" if math.isfinite(self.low) else ""
-        return f"{self.name} ({self.ratio:.3g}{interval} times its error)"
+        return f"{self.name} ({self.ratio:.3g}{interval} times as large)"
+
+    @property
+    def equal(self) -> bool:
+        """Whether the errors are the same on every recording."""
+        return self.ratio == 1.0 and not self.low < self.high
 
 
 @dataclass(frozen=True)
@@ -66,9 +71,14 @@ class Winner:
 
     def sentences(self) -> list[str]:
         """The answer: the winner, the margin, what is level, and the test."""
-        level = [str(rival) for rival in self.rivals if not rival.differs]
+        equal = [rival.name for rival in self.rivals if rival.equal]
+        level = [str(rival) for rival in self.rivals if not (rival.differs or rival.equal)]
         behind = [str(rival) for rival in self.rivals if rival.differs]
         smallest, tested = f"{self.name} has the smallest error", self.n_recordings >= MIN_UNITS
+        if equal and not (level or behind):
+            said = [f"{_BETWEEN.join([self.name, *equal])}: the same error, {self.error_m:.3g} m."]
+            return [*said, f"Over {pluralize(self.n_recordings, 'recording')}."]
+        smallest = f"{smallest} (as {_BETWEEN.join(equal)})" if equal else smallest
         if level and tested:
             said = [
                 f"No single winner: {smallest}, {self.error_m:.3g} m, but not significantly "

@@ -85,6 +85,7 @@ DEFAULTS = {
     "Encoder": "9c7c1c0b",
     "External": "a594d99f",
     "FastSLAM": "02dccffb",
+    "FilterpyEkf": "0b6fa43b",
     "FixedLag": "13e55cd8",
     "GraphSlam": "f4b95616",
     "GtsamBatch": "644cfc1c",

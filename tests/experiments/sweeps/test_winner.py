@@ -46,7 +46,7 @@ def test_the_winner_its_margin_and_what_is_level():
     words = " ".join(won.sentences())
     assert "No single winner: good has the smallest error, 0.0103 m" in words
     assert "not significantly smaller than that of level (1.01 [" in words
-    assert "Significantly worse: bad (3 [2.9, 3.1] times its error)." in words
+    assert "Significantly worse: bad (3 [2.9, 3.1] times as large)." in words
     assert (
         "Paired t tests of the logs of all pairs over 8 recordings, at 5 % in all (Holm)." in words
     )
