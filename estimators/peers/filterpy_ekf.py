@@ -12,6 +12,7 @@ from estimators.graph.landmark_drive import read_observations
 from estimators.landmarks.stereo import StereoModel, StereoOptions
 from estimators.peers import package
 from estimators.wheels import WheelOptions, WheelPrediction
+from sim import se2
 from sim.arrays import Array, Ints
 from sim.options import options
 from sim.recording import Frame
@@ -46,8 +47,9 @@ class FilterpyEkf(FilterpyEkfOptions):
         n = len(ekf.x)
         F, Q = np.eye(n), np.zeros((n, n))
         F[:3, :3], Q[:3, :3] = by_pose, by_motion @ motion.covariance @ by_motion.T
-        ekf.x[:3] = pose
-        ekf.P = F @ ekf.P @ F.T + Q  # the prediction is not linear, so `predict` does not fit
+        ekf.F, ekf.Q = F, Q
+        ekf.predict()
+        ekf.x[:3] = pose  # which `predict` takes to be linear
         seen, status = read_observations(frame, self.stereo, self._camera, "filterpy_ekf")
         if seen is not None:
             self._see(*seen)
@@ -76,12 +78,13 @@ class FilterpyEkf(FilterpyEkfOptions):
         """Put a landmark, seen at a point (2,) of base_link, into the state."""
         ekf, n = self._ekf, len(self._ekf.x)
         turn = _turn(ekf.x[2])
-        arm = turn @ point
+        place = se2.transform(ekf.x[:3], point[None])[0]
+        arm = place - ekf.x[:2]
         G = np.eye(n + 2, n)
         G[n:, :2], G[n:, 2] = np.eye(2), (-arm[1], arm[0])
         P = G @ ekf.P @ G.T
         P[n:, n:] += turn @ noise @ turn.T
-        ekf.x, ekf.P = np.append(ekf.x, ekf.x[:2] + arm), P
+        ekf.x, ekf.P = np.append(ekf.x, place), P
         ekf.dim_x, ekf._I = n + 2, np.eye(n + 2)  # filterpy's own filters do not grow
         self._places[number] = n
 
@@ -93,9 +96,7 @@ def _turn(heading_rad: float) -> Array:
 
 def _expected(x: Array, at: Ints) -> Array:
     """Places (2 K,) in base_link of the landmarks that begin at these rows of the state."""
-    arms = x[at[:, None] + [0, 1]] - x[:2]
-    expected: Array = (arms @ _turn(x[2])).ravel()
-    return expected
+    return se2.transform(se2.inverse(x[:3]), x[at[:, None] + [0, 1]]).ravel()
 
 
 def _jacobian(x: Array, at: Ints) -> Array:

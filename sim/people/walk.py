@@ -154,7 +154,7 @@ class Crowd:
         self._asked = np.where(self._stood >= _PATIENCE_STEPS, _ASIDE_STEPS, self._asked - 1)
         clear_m = np.full(len(state), radius_m)  # that each keeps from walls
         for robot in np.flatnonzero(self._asked > 0).tolist():
-            asked = self._step_aside(state[:, :2], poses[robot], self._reach_m[robot], targets)
+            asked = self._step_aside(robot, poses[robot], targets)
             # the cells know a clearance to two diagonals, and keep it by one of them at least
             clear_m[asked] = self.people.torso_radius_m - math.sqrt(2.0) * self._ground.cell_m
         ground = self._ground
@@ -184,15 +184,14 @@ class Crowd:
         self._way[person] = way
         return _ahead(way) if len(way) else at
 
-    def _step_aside(self, at: Array, pose: Array, reach_m: float, targets: Array) -> Bools:
+    def _step_aside(self, number: int, pose: Array, targets: Array) -> Bools:
         """Let those ahead of a robot, which waits at a pose (3,), walk to its sides: who (n,)."""
         cos, sin = math.cos(pose[2]), math.sin(pose[2])
-        axes = np.array([[cos, sin], [-sin, cos]])  # rows are the robot's, in map
-        in_base = (at - pose[:2]) @ axes.T
-        gaps = np.hypot(*in_base.T) - reach_m - self.people.radius_m
-        asked: Bools = (in_base[:, 0] > 0.0) & (gaps < _ASIDE_M)
-        side = np.where(in_base[:, 1] < 0.0, -1.0, 1.0)
-        targets[asked] = (at + side[:, None] * axes[1])[asked]
+        left = np.array([-sin, cos])
+        gaps, offsets = self.gaps_m(number, pose)
+        asked: Bools = (offsets @ [cos, sin] > 0.0) & (gaps < _ASIDE_M)
+        side = np.where(offsets @ left < 0.0, -1.0, 1.0)
+        targets[asked] = (self._states[-1][:, :2] + side[:, None] * left)[asked]
         return asked
 
     def _lead(self, ways: Ways, at: Array) -> float:

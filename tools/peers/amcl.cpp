@@ -17,7 +17,7 @@
 #include "nav2_amcl/map/map.hpp"
 #include "nav2_amcl/pf/pf.hpp"
 #include "nav2_amcl/sensors/laser/laser.hpp"
-#include "src/motion_model/differential_motion_model.cpp"  // where older sources define the class
+#include "src/motion_model/differential_motion_model.cpp"  // some versions have its class here alone
 
 using Settings = std::map<std::string, double>;
 

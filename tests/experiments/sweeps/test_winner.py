@@ -32,6 +32,15 @@ DRIVES = np.array([0.8, 1.3, 1.0, 0.7, 1.5, 1.1, 0.9, 1.2])
 NOISE = np.exp(0.05 * np.array([1.0, -0.5, 0.3, -1.2, 0.9, -0.2, 0.4, -0.7]))
 
 
+def test_methods_with_the_same_errors_are_equal():
+    same = {"one": 0.01 * DRIVES, "other": 0.01 * DRIVES}
+    said = find_winner(rows(same)).sentences()
+    assert said == ["one, other: the same error, 0.0103 m.", "Over 8 recordings."]
+    said = find_winner(rows({**same, "bad": 0.03 * DRIVES * NOISE})).sentences()
+    assert said[0] == "one has the smallest error (as other): 0.0103 m."
+    assert said[1].startswith("Significantly worse: bad (")
+
+
 def test_the_winner_its_margin_and_what_is_level():
     errors = {"good": 0.01 * DRIVES, "level": 0.0101 * DRIVES * NOISE, "bad": 0.03 * DRIVES * NOISE}
     won = find_winner(rows(errors))

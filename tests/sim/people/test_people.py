@@ -136,54 +136,53 @@ def test_cameras_and_lidars_look_past_and_over():
     assert cloud[0, 2] == pytest.approx(2.8 / np.cos(0.01))
 
 
-def test_the_robot_waits_for_somebody_who_stays():
+def driven_at(person, seconds):
+    """A robot that wants to go on along x, with one person (x, y) who stays, and is not touched.
+
+    Its driver, its pose, which the driver sees, positions (T,) m along x, and the last speed, m/s.
+    """
     from sim.people.giving_way import GivingWay
 
-    pose = np.zeros(3)
+    pose, reached = np.zeros(3), []
     command = SimpleNamespace(command=lambda tick, pose: np.array([0.5, 0.0]), trouble=None)
-    crowd, _ = crowd_at([[2.0, 0.0, 0.0, 0.0]])
+    crowd, _ = crowd_at([[*person, 0.0, 0.0]])
     driver = GivingWay(command, crowd, 0, ROBOT, lambda: pose)
-    gaps = []
-    for tick in range(300 * 25):
+    for tick in range(300 * seconds):
         velocity = driver.command(tick, pose)
-        pose = pose + np.array([velocity[0] / 300.0, 0.0, 0.0])
-        gaps.append(2.0 - pose[0] - np.hypot(0.2, 0.15) - People().radius_m)
+        pose[0] += velocity[0] / 300.0
+        reached.append(pose[0])
+        assert driver.trouble is None
+    return driver, pose, np.array(reached), velocity[0]
+
+
+def test_the_robot_waits_for_somebody_who_stays():
+    driver, pose, reached, speed = driven_at([2.0, 0.0], 25)
+    gaps = 2.0 - reached - np.hypot(0.2, 0.15) - People().radius_m
     assert 0.2 < gaps[300 * 10] < 0.35  # with room to step aside
     assert 0.02 < gaps[-1] < 0.1  # once that has not helped
-    assert abs(velocity[0]) < 0.01
-    assert driver.trouble is None
-    pose = np.array([2.0, 0.1, 0.0])
+    assert abs(speed) < 0.01
+    pose[:] = [2.0, 0.1, 0.0]
     assert driver.trouble == "collision"
 
 
 def test_a_robot_that_has_waited_goes_past_somebody_beside_its_way():
-    from sim.people.giving_way import GivingWay
-
-    pose = np.zeros(3)
-    command = SimpleNamespace(command=lambda tick, pose: np.array([0.5, 0.0]), trouble=None)
-    crowd, _ = crowd_at([[2.0, 0.45, 0.0, 0.0]])
-    driver = GivingWay(command, crowd, 0, ROBOT, lambda: pose)
-    reached = []
-    for tick in range(300 * 30):
-        pose = pose + np.array([driver.command(tick, pose)[0] / 300.0, 0.0, 0.0])
-        reached.append(pose[0])
-        assert driver.trouble is None
+    _, _, reached, _ = driven_at([2.0, 0.45], 30)
     assert reached[300 * 10] < 2.0
     assert reached[-1] > 3.0
 
 
-def test_those_ahead_of_a_robot_that_waits_step_aside():
-    crowd, _ = crowd_at([[0.8, 0.1, 0.0, 0.0], [0.8, -0.1, 0.0, 0.0], [-0.8, 0.1, 0.0, 0.0]])
+@pytest.mark.parametrize(("heading_rad", "sideways"), [(0.0, 1), (np.pi / 2.0, 0)])
+def test_those_ahead_of_a_robot_that_waits_step_aside(heading_rad, sideways):
     at = np.array([[0.8, 0.1], [0.8, -0.1], [-0.8, 0.1]])
-    turned = at[:, ::-1] * [-1.0, 1.0]
-    for pose, spots, sideways in ((np.zeros(3), at, 1), (np.array([0, 0, np.pi / 2]), turned, 0)):
-        targets = spots.copy()
-        assert list(crowd._step_aside(spots, pose, 0.3, targets)) == [True, True, False]
-        moved = targets - spots
-        sides = moved[:2, sideways] * np.sign(spots[:2, sideways])
-        np.testing.assert_allclose(sides, 1.0)
-        np.testing.assert_allclose(moved[:2, 1 - sideways], 0.0, atol=1e-12)
-        np.testing.assert_array_equal(moved[2], 0.0)
+    spots = at if sideways == 1 else at[:, ::-1] * [-1.0, 1.0]
+    crowd, _ = crowd_at(np.column_stack([spots, np.zeros((3, 2))]))
+    targets = spots.copy()
+    asked = crowd._step_aside(0, np.array([0.0, 0.0, heading_rad]), targets)
+    assert list(asked) == [True, True, False]
+    moved = targets - spots
+    np.testing.assert_allclose(moved[:2, sideways] * np.sign(spots[:2, sideways]), 1.0)
+    np.testing.assert_allclose(moved[:2, 1 - sideways], 0.0, atol=1e-12)
+    np.testing.assert_array_equal(moved[2], 0.0)
 
 
 def test_what_makes_no_sense_is_said():
