@@ -109,7 +109,10 @@ def audit(minutes: float, n_rows: int | None, seed: int) -> bool:
     require(minutes > 0.0, f"minutes must be positive, got {minutes:g}")
     require(n_rows is None or n_rows > 0, f"rows must be positive, got {n_rows}")
     tables = dict(_judged_tables())
-    require(bool(tables), f"{results() / 'tables'}: no judged tables; run `make reproduce FULL=1`")
+    require(
+        bool(tables),
+        f"{results() / 'tables'}: no judged tables; judge them, or audit in a clone",
+    )
     budget_s = 60.0 * minutes * (os.cpu_count() or 1) if n_rows is None else np.inf
     drawn = draw(tables, np.random.default_rng(seed), budget_s, n_rows)
     drawn.sort(key=lambda each: -each.cost_s)

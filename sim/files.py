@@ -18,7 +18,8 @@ def require_file(path: Path) -> None:
     """
     with suppress(OSError, ValueError):
         mode = path.stat().st_mode
-        require(stat.S_ISREG(mode), f"{path}: not a file; name a file, or remove it")
+        folder = " in it" if stat.S_ISDIR(mode) else ""
+        require(stat.S_ISREG(mode), f"{path}: not a file; name a file{folder}, or remove it")
 
 
 def sha256_of(path: Path) -> str:

@@ -71,6 +71,7 @@ _FLOOR_SIGMA, _FLOOR_SHARE = 0.02, 0.05  # of wheels that scans deny: m and rad;
 # hall of tables and chairs, by 0.2 m
 _LEAST_OVERLAP, _OVERLAP, _WRONG = 0.7, 0.8, np.diag(np.square([0.3, 0.3, 0.06]))
 _DENIED, _SEEN, _DENIALS = 0.5, 0.3, 4  # share that fits, and is seen; checks in a row
+_SLACK_M = 10.0  # path of a chain that may be off by all of the slack
 _FINE = np.diag(np.square([0.03, 0.03, 0.01]))  # what finish looks for, whatever the graph claims
 _MISFIT_M, _MISFIT_RAD, _HELD_BY_M = 0.08, 0.025, 3.0  # closures that others replace
 _WITHDRAWN = 2.0  # times robust_sigma, by which a closure misses the graph that lets go of it
@@ -458,7 +459,8 @@ class GraphSlam(GraphSlamOptions):
             return None
         off = se2.difference(found.motion.mean, expected.mean)
         noise = found.motion.covariance
-        spread = expected.covariance + noise + SLACK
+        apart_m = self._driven_m(second) - self._driven_m(first)
+        spread = expected.covariance + noise + min(apart_m / _SLACK_M, 1.0) * SLACK
         if not within_gate(off, spread, self.loop_gate_probability):
             return None
         if min_gain is None and not self._search.worthwhile(expected.covariance, noise):

@@ -49,6 +49,8 @@ class OfflineOptions(ProgramOptions):
     the files' names.
     """
 
+    settings: dict[str, float | int | str | bool] | None = None
+    """Further words KEY=VALUE of the command; null: none."""
     limit_s: Seconds = 600.0
     """Longest time that it may take, s."""
     output: Output = "tum"
@@ -109,7 +111,8 @@ class Offline(OfflineOptions):
         """Write the log, run the command, and read its trajectory."""
         with tempfile.TemporaryDirectory(prefix="estima-") as name:
             places = self._written(Path(name))
-            program = start([fill(word, places) for word in self.words])
+            chosen = [f"{key}={value}" for key, value in (self.settings or {}).items()]
+            program = start([*(fill(word, places) for word in self.words), *chosen])
             try:
                 program.wait(self.limit_s)
             finally:

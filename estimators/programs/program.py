@@ -36,6 +36,7 @@ MRPT_PROGRAM, AMCL_PROGRAM = "build/peers/mrpt", "build/peers/amcl"
 _COMPILED = {MRPT_PROGRAM: "make peers", AMCL_PROGRAM: "make peers NAV2=FOLDER"}  # by what
 _TAIL = 2000  # bytes of its messages that are kept
 _CHUNK = 1 << 16
+_ERROR = re.compile(r"\w*(Error|Exception)\b")  # line of an error, which not all languages put last
 _PATIENCE_S = 2.0  # to end by itself once its input is closed
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
@@ -293,8 +294,13 @@ class Program:
             self._messages += os.read(self._stderr, _CHUNK)[-_TAIL:]
         lines = self._messages.decode(errors="replace").strip().splitlines()
         self.close(0.0)
-        last = f": {printable(lines[-1])[:300]}" if lines else ""
+        last = f": {printable(_telling(lines))[:300]}" if lines else ""
         return ProgramError(f"{self.name} {what}{last}")
+
+
+def _telling(lines: Sequence[str]) -> str:
+    """The line of a program's last words that says most: of an error, or else the last."""
+    return next((line for line in reversed(lines) if _ERROR.match(line.strip())), lines[-1])
 
 
 def start(words: Sequence[str]) -> Program:

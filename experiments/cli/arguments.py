@@ -62,7 +62,16 @@ class CommandLine:
         require(not others, f"{' '.join(others)}: {known}")
         if given.config_dir is not None:
             find_own_code(Path(given.config_dir))
+        _check_once(given.overrides)
         return cls(given.overrides, given.config_dir, given.cfg is not None, given.resolve)
+
+
+def _check_once(overrides: Sequence[str]) -> None:
+    """Refuse a key that is set twice, of which the second would count without a word."""
+    for one in overrides:
+        key = one.lstrip("+").partition("=")[0]
+        same = [other for other in overrides if other.lstrip("+").partition("=")[0] == key]
+        require(len(set(same)) == 1, f"{key} is set twice ({', '.join(same)}); leave one out")
 
 
 def run_arguments(arguments: Sequence[str], draw: Draw, out: Path | None = None) -> None:
@@ -94,7 +103,5 @@ def _say_next(experiment: Experiment, line: CommandLine) -> None:
     if experiment.command is not None:  # `view` cannot be told it
         return
     drive = shlex.join(["estima", "record", "-o", "run.npz", *line.overrides, *options])
-    view, place = ["estima", "view", "run.npz", "-e", experiment.estimator_name, *options], "window"
-    if experiment.team is not None:
-        view, place = [*view, "-o", "run.html"], "file"
-    show(f"      as it moves, in a {place}: {drive} && {shlex.join(view)}")
+    view = ["estima", "view", "run.npz", "-e", experiment.estimator_name, *options]
+    show(f"      as it moves: {drive} && {shlex.join([*view, '-o', 'run.html'])}")

@@ -103,7 +103,9 @@ def convert(
     out: Annotated[
         Path,
         typer.Option(
-            "--out", "-o", help="File to write: .npz, .mcap, .bag, .db3, .log (CARMEN), .tum."
+            "--out",
+            "-o",
+            help="File to write: .npz, .mcap, .bag, .db3, .log (CARMEN), .tum; .yaml of a map.",
         ),
     ],
     robot: WhichRobot = None,
@@ -135,6 +137,8 @@ def convert(
       estima convert run.mcap --truth reference.tum --from 12 --until 300 -o run.npz
 
       estima convert estimate.csv -o estimate.tum
+
+      estima convert wean.dat.gz -o wean.yaml
     """
     from experiments.trajectories.convert import convert_log, convert_team
     from experiments.trajectories.part import WHOLE, Part

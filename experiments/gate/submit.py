@@ -376,7 +376,7 @@ def table_of(score: Score) -> pd.DataFrame:
     means = {n: averages(sound, by, RECORDING, n)["value"].unstack() for n in SHOWN if n in sound}
     table = pd.DataFrame(index=pd.Index(sorted(set(rows[BOARD])), name=BOARD))
     for column, title in SHOWN.items():
-        table[title] = means[column].get(name) if column in means else np.nan
+        table[title] = means[column].get(name, np.nan) if column in means else np.nan
     errors = means.get("answer_ate_rmse_m", pd.DataFrame())
     own, reckoned = (errors.get(one, np.nan) for one in (name, "odometry"))
     table["error over odometry's"] = own / reckoned

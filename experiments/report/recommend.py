@@ -109,7 +109,8 @@ def recommend(
     """
     for key, reason in {
         "estimator": "every one is considered",
-        "recording": "state its robot and sensors, by which estimators are compared",
+        "recording": "say what it was made with, such as sensors=lms291 robot.kr=1e-5; "
+        "`estima info LOG` says what a log holds",
     }.items():
         require(
             not any(o.lstrip("+~").startswith(key) for o in overrides),

@@ -343,7 +343,12 @@ def searched(config_dir: str | Path | None) -> list[str]:
     folder = Path(config_dir).resolve()
     require(folder.is_dir(), f"{config_dir}: no such folder of options")
     require("${" not in str(folder), f"{folder}: Hydra takes ${{ for a value; rename the folder")
-    for group in (*GROUPS, "study"):
+    groups = (*GROUPS, "study")
+    require(
+        any((folder / group).is_dir() for group in groups) or not any(folder.glob("*.yaml")),
+        f"{config_dir}: its options lie in no group; an estimator's goes to {config_dir}/estimator",
+    )
+    for group in groups:
         for path in sorted((folder / group).rglob("*.yaml")):
             _check_option(path)
     return [f"{_SEARCHED}[{paths.quoted(f'file://{folder}')}]"]

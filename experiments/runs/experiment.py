@@ -256,8 +256,8 @@ class Experiment(Objects):
         mapped = self.config["prior"]["map"] != "none" or settings.get("map_path")
         require(
             mapped or "map" not in needs,
-            f"estimator={self.estimator_name} needs a map; set prior.map=world, or a mapping with "
-            "_target_",
+            f"estimator={self.estimator_name} needs a map; set prior.map=world, "
+            "prior.map=GRID.yaml, or a mapping with _target_",
         )
 
     def _check_map(self) -> None:

@@ -31,6 +31,8 @@ class Range:
         tuple[Scalar, ...], Strict(False), Field(min_length=2), "a list of two plain values or more"
     ] = ()
     """The values of a choice."""
+    default: Scalar = None
+    """Value unless set, where the option's own file does not say: that of a program's setting."""
 
     def __post_init__(self) -> None:
         require(
@@ -46,7 +48,7 @@ class Range:
             require(not self.log or low > 0, "range.interval in the log must begin above 0")
 
     def has(self, value: Any) -> bool:
-        """Whether a value lies in it."""
+        """Whether an option may take a value."""
         if self.interval is None:
             return value in self.choice
         number = isinstance(value, (int, float)) and not isinstance(value, bool)

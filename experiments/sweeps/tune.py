@@ -84,7 +84,11 @@ def tuning_of(study: str, config_dir: str | None = None) -> Tuning:
     """The `tune` of a study's YAML."""
     cfg = compose_options([*searched(config_dir), f"study={study}"])
     settings: Any = OmegaConf.to_container(cfg)
-    return build(Tuning, settings.get("tune"), f"study={study}: tune")
+    require(
+        settings.get("tune") is not None,
+        f"study={study}: its YAML has no `tune`, which names seeds and ranges, as study=peers has",
+    )
+    return build(Tuning, settings["tune"], f"study={study}: tune")
 
 
 def tune(
@@ -175,9 +179,21 @@ def write(tuned: TuningResult, study: str, tuning: Tuning, folder: Path) -> Path
         f"# On {tuned.n_judged} other recordings its error is {tuned.gain.value:.2f} "
         f"[{tuned.gain.low:.2f}, {tuned.gain.high:.2f}] times the default's.\n"
         f"defaults:\n  - {option}\n  - _self_\n"
-        + (yaml.safe_dump(dict(tuned.values), sort_keys=False) if tuned.values else ""),
+        + (yaml.safe_dump(nested(tuned.values), sort_keys=False) if tuned.values else ""),
     )
     return path
+
+
+def nested(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Values by key as options: `settings.width` is a key of the option `settings`."""
+    options: dict[str, Any] = {}
+    for key, value in values.items():
+        option, _, setting = key.partition(".")
+        if setting:
+            options.setdefault(option, {})[setting] = value
+        else:
+            options[key] = value
+    return options
 
 
 def trials_table(results: Sequence[TuningResult]) -> pd.DataFrame:
@@ -279,14 +295,17 @@ def _problem(study: str, name: str, tuning: Tuning, config_dir: str | None) -> _
     )
     drives[0].check()
     options, ranges = drives[0].options_of("estimator"), tuning.estimators[name]
+    default: dict[str, Any] = {}
     for key, allowed in ranges.items():
-        require(key in options, f"{name} has no option {key}; it has {', '.join(options)}")
+        option, _, setting = key.partition(".")
+        require(option in options, f"{name} has no option {key}; it has {', '.join(options)}")
+        stated = (options[option] or {}) if setting else options
+        default[key] = stated.get(setting or key, allowed.default)
         require(
-            allowed.has(options[key]),
-            f"tune.estimators.{name}.{key} must hold the default, {options[key]!r}, so that it is "
+            allowed.has(default[key]),
+            f"tune.estimators.{name}.{key} must hold the default, {default[key]!r}, so that it is "
             "a trial too",
         )
-    default = {key: options[key] for key in ranges}
     return _Problem(name, tuning.trials, ranges, drives, judged, default)
 
 
@@ -319,7 +338,8 @@ def _judged(
     key = json.dumps([_digest(judged, {}), values], sort_keys=True)
     kept: dict[str, list[float]] = study.user_attrs.get("judged", {})
     if key not in kept:
-        runs = (delayed(error_m)(experiment.with_estimator(**values)) for experiment in judged)
+        options = nested(values)
+        runs = (delayed(error_m)(experiment.with_estimator(**options)) for experiment in judged)
         kept = {**kept, key: list(Parallel(n_jobs=jobs)(runs))}
         study.set_user_attr("judged", kept)
     return kept[key]
@@ -344,7 +364,7 @@ def _mean_log_error(trial: Any, problem: _Problem) -> float:
     values = {name: _suggested(trial, name, allowed) for name, allowed in problem.ranges.items()}
     logs = []
     for i, experiment in enumerate(problem.drives):
-        logs.append(math.log(error_m(experiment.with_estimator(**values))))
+        logs.append(math.log(error_m(experiment.with_estimator(**nested(values)))))
         trial.report(logs[-1], i)
         if i + 1 < len(problem.drives) and trial.should_prune():
             raise _optuna().TrialPruned

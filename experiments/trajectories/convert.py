@@ -19,8 +19,10 @@ from sim.files import check_writable
 from sim.formats.detect import describe_choice, kind_of, read_any
 from sim.formats.mrclam import read_team
 from sim.formats.tum import write_tum
+from sim.formats.wean import read_grid as read_map
 from sim.recording import Recording, save
 from sim.team import save as save_team
+from sim.worlds.grid_file import write_grid
 
 _BAGS = (".mcap", ".bag", ".db3", "")
 ESTIMATES = (".tum", ".csv", ".json", *_BAGS)
@@ -136,7 +138,7 @@ def convert_log(
     topic: str | None = None,
     part: Part = WHOLE,
 ) -> str:
-    """Convert a log, or an estimate, to the file that its new name says; say what was written.
+    """Convert a log, an estimate or a map to the file that its new name says; say what was written.
 
     Parameters
     ----------
@@ -148,6 +150,12 @@ def convert_log(
         Of a log.
     """
     _check_output(log, out)
+    if out.suffix == ".yaml":
+        require(len(log) == 1, f"{log[0]}: a map is one file, got {len(log)}")
+        grid = read_map(log[0]).grid
+        write_grid(grid, out, "raw")
+        rows, columns = grid.probability.shape
+        return f"{out}: {columns} x {rows} cells of {grid.resolution_m:g} m, and {out.stem}.pgm"
     if topic is not None or is_estimate(log):
         require(len(log) == 1, f"{log[0]}: an estimate is one file, got {len(log)}")
         require(part == WHOLE, f"{log[0]}: a truth and a part are for logs, not for estimates")

@@ -192,7 +192,8 @@ def read_all(paths: Sequence[Path], robot: int | None = None) -> Team:
         return Team((team.robots[robot],))
     log = _format_of(first)
     least, most = log.n_files
-    wanted = f"{least} to {most} files" if most > 1 else "one file"
+    several = f"{least}" if least == most else f"{least} to {most}"
+    wanted = f"{several} files" if most > 1 else "one file"
     require(least <= len(paths) <= most, f"{first}: a {log.name} log is {wanted}, got {len(paths)}")
     require(len(set(paths)) == len(paths), f"{first}: named twice; its files differ")
     require(

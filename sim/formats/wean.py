@@ -21,6 +21,7 @@ from sim.formats.text import Words, read_words
 from sim.recording import Recording
 from sim.robot.drive import RobotGeometry
 from sim.sensors import Mount
+from sim.worlds.grid import OccupancyGrid
 
 _N_BEAMS = 180
 _NO_RETURN_M = 81.83  # and beyond, up to 81.91
@@ -52,6 +53,11 @@ class Grid:
     def occupancy(self) -> Array:
         """Probability (X, Y) that a cell is occupied, NaN where nothing is known."""
         return 1.0 - self.values if self.free_is_one else self.values
+
+    @property
+    def grid(self) -> OccupancyGrid:
+        """The map as all methods know one."""
+        return OccupancyGrid(self.occupancy.T.astype(np.float32), self.cell_m)
 
 
 def read_wean(

@@ -68,7 +68,7 @@ class GivingWay:
         return self._pace * self._wanted
 
     def _allowed(self, v_mps: float, turn_radps: float) -> float:
-        """Share of the speed at which the robot can still stop short of everybody.
+        """Share of the speed at which the robot can still stop short of everybody ahead of it.
 
         A robot that has waited long leaves people ahead no room to step aside, and goes straight
         past those who stand beside its way.
@@ -79,17 +79,17 @@ class GivingWay:
             math.cos(pose[2]) * offsets[:, 0] + math.sin(pose[2]) * offsets[:, 1]
         )
         nearing = np.maximum(towards / np.hypot(*offsets.T), 0.0)  # share of the speed
-        kept_off_m, counts = _KEPT_OFF_M, np.ones(len(gaps), bool)
+        speeds = nearing * abs(v_mps)
+        kept_off_m, counts = _KEPT_OFF_M, speeds > 0.0
         if self._squeezes_s > 0.0:
-            kept_off_m, counts = 0.0, nearing > 0.0
+            kept_off_m = 0.0
             if abs(turn_radps) < _STRAIGHT_RADPS:
                 off = math.cos(pose[2]) * offsets[:, 1] - math.sin(pose[2]) * offsets[:, 0]
                 beside_m = np.abs(off) - self._half_width_m - self._crowd.people.radius_m
                 counts &= beside_m <= _BESIDE_M
         room_m = np.maximum(gaps - _BESIDE_M - kept_off_m * nearing, 0.0)
-        speeds = nearing * abs(v_mps)
         most = np.sqrt(2.0 * self._brake_mps2 * room_m)
-        return float(np.min((most / np.maximum(speeds, 1e-9))[counts], initial=1.0))
+        return float(np.min(most[counts] / speeds[counts], initial=1.0))
 
     @property
     def trouble(self) -> str | None:

@@ -56,6 +56,11 @@ def test_unknown_options_are_refused_with_the_known_ones(argument):
         CommandLine.of(["seed=1", "--config-dir"])
 
 
+def test_a_key_that_is_set_twice_is_refused():
+    with pytest.raises(InputError, match=r"^seed is set twice \(seed=1, seed=2\)"):
+        CommandLine.of(["seed=1", "estimator=odometry", "seed=2"])
+
+
 @pytest.mark.parametrize(
     "override", ["hydra.run.dir=x", "hydra/sweeper=ax", "hydra.verbose=true", "hydra.job.name=x"]
 )

@@ -10,6 +10,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from shlex import quote
 
 import pytest
 
@@ -49,6 +50,8 @@ def desk(tmp_path):
 def run_page(text, folder, environment):
     """Run the blocks of a page one after the other; return how many ran, and why others did not."""
     ran, left = 0, []
+    at = folder.parent / "at.txt"
+    at.write_text(str(folder))
     for name, code in re.findall(r"One file, `(\S+)`:\n\n```python\n(.*?)```", text, re.S):
         (folder / name).write_text(code)
     for name, code in re.findall(r"YAML, `(\S+)`:\n\n```yaml\n(.*?)```", text, re.S):
@@ -66,11 +69,13 @@ def run_page(text, folder, environment):
         if how == "not run":
             left.append(what)
             continue
-        # -E and the trap name the command that failed; exports hold within a block, as on a page
-        script = "set -eEuo pipefail\ntrap 'echo \"failed: $BASH_COMMAND\" >&2' ERR\n" + lines
+        # -E and the trap name the command that failed; exports hold within a block, and the next
+        # one starts in the folder where this one ended
+        ended = f"trap 'pwd > {quote(str(at))}' EXIT\n"
+        script = "set -eEuo pipefail\ntrap 'echo \"failed: $BASH_COMMAND\" >&2' ERR\n" + ended
         done = subprocess.run(
-            ["bash", "-c", script], cwd=folder, env=environment, capture_output=True, text=True,
-            timeout=900,
+            ["bash", "-c", script + lines], cwd=at.read_text().strip(), env=environment,
+            capture_output=True, text=True, timeout=900,
         )  # fmt: skip
         assert done.returncode == 0, f"{lines}\n{done.stdout[-1500:]}\n{done.stderr[-3000:]}"
         assert "Traceback" not in done.stderr, done.stderr[-3000:]
@@ -88,5 +93,7 @@ def test_the_commands_of_a_page_run_in_order(page, desk):
 def test_a_command_that_fails_is_named(desk):
     text = "```sh\necho fine\n```\n<!-- not run: no -->\n```sh\nfalse\n```\n"
     assert run_page(text, *desk) == (1, ["no"])
+    moved = "```sh\nmkdir deep && cd deep\n```\n```sh\ntest $(basename $PWD) = deep\n```\n"
+    assert run_page(moved, *desk) == (2, [])
     with pytest.raises(AssertionError, match="failed: ls missing"):
         run_page("```sh\nls missing  # a comment\n```\n", *desk)

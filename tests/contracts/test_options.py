@@ -98,7 +98,7 @@ DEFAULTS = {
     "Lidar3D": "29cea5d0",
     "Mcl": "a1971896",
     "Odometry": "3fb34598",
-    "Offline": "f6fdb4d2",
+    "Offline": "d6b7b12c",
     "PlaceDescriptor": "af6aa1df",
     "RealCamera": "8d155e5d",
     "RealLaser": "efcccb79",

@@ -162,6 +162,10 @@ BAD = {
         "unknown key covarience; did you mean covariance.* known: covariance,",
     ),
     "error": ("print('{\"error\": \"no scan\"}', flush=True)", "the error no scan"),
+    "node": (
+        "sys.stderr.write('TypeError: no x\\n    at mine.js:3\\n\\nNode.js v18\\n'); sys.exit(1)",
+        "ended with code 1: TypeError: no x",
+    ),
     "two_lines": (f"print('{_BELIEF}\\n{_BELIEF}', flush=True)", "after its answer|being asked"),
     "greeting": ("print('hello\\n{}', flush=True)", "after its answer 'hello'|being asked"),
     "far": ("print('{\"mean\": [1e300, 0, 0]}', flush=True)", r"mean, numbers up to 1e\+12"),

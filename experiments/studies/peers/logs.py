@@ -160,8 +160,7 @@ def _wean(number: int) -> Case:
     logged = wean_hall(number)
     # corridors hide how far scans are apart, so the wheels' gains and the mount are the log's own
     found = calibrate_log(logged).calibration
-    told = wean.read_grid(DATA / "wean_hall_mcl" / "wean.dat.gz")
-    grid = OccupancyGrid(told.occupancy.T.astype(np.float32), told.cell_m)
+    grid = wean.read_grid(DATA / "wean_hall_mcl" / "wean.dat.gz").grid
     mean = _refined(logged, np.array(WEAN_STARTS[number]), grid)
     prior = Prior(logged.robot, logged.sensors, mean, np.diag(np.square(WEAN_SIGMAS)), grid)
     return Case(f"wean {number}", logged, found, prior, FIT)

@@ -3,10 +3,12 @@
 import json
 import math
 import os
+import re
 import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -38,6 +40,8 @@ hydra:
     params:
       seed: range({judged},{end})
 """
+
+ROOT = Path(__file__).resolve().parents[3]
 
 
 @pytest.fixture
@@ -184,6 +188,25 @@ def test_what_does_not_fit_the_estimator_is_told_before_any_run(study, tmp_path)
     with pytest.raises(InputError, match="does not tune mcl"):
         list(tuning.tune("toy", ["mcl"], config_dir=write()))
     assert not calls
+
+
+def test_settings_of_a_program_are_options_of_an_option():
+    values = {"settings.width": 0.1, "settings.beams": 20, "kind": "online"}
+    assert tuning.nested(values) == {"settings": {"width": 0.1, "beams": 20}, "kind": "online"}
+
+
+@pytest.mark.parametrize("source", ["mrpt.cpp", "amcl.cpp"])
+def test_the_defaults_of_programs_are_their_own(source):
+    text = (ROOT / "tools" / "peers" / source).read_text()
+    sections = re.findall(r"const char\* const (\w+) = R\"\((.*?)\)\"", text, re.S)
+    known = {
+        f"mrpt_{mode.lower()}": dict(re.findall(r"^(\w+)=(\S+)$", body, re.M))
+        for mode, body in sections
+    } or {"nav2_amcl": dict(re.findall(r"\{\"(\w+)\", ([\d.]+)\}", text))}
+    ranges = tuning.tuning_of("peers").estimators
+    for name, defaults in known.items():
+        for key, allowed in ranges[name].items():
+            assert float(defaults[key.removeprefix("settings.")]) == allowed.default
 
 
 def test_without_optuna_it_says_so(monkeypatch):

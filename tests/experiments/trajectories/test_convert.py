@@ -13,6 +13,7 @@ from sim.formats.detect import kind_of, read_any
 from sim.formats.rosbag_in import read_tracks
 from sim.formats.tum import read_tum
 from sim.recording import load, save
+from sim.worlds.grid_file import read_grid
 from tests.fixtures import fakes
 from tests.fixtures import log_samples as samples
 
@@ -132,5 +133,9 @@ def test_the_commands(tmp_path, capsys):
     shown = runner.invoke(app, ["info", str(folder / "carmen.log")])
     assert "source      carmen" in shown.output
     assert "scans longest gap s: 1.0" in shown.output
+    (folder / "map.dat").write_bytes(samples.wean_map())
+    done = runner.invoke(app, ["convert", str(folder / "map.dat"), "-o", str(folder / "map.yaml")])
+    assert "2 x 3 cells of 0.1 m" in done.output
+    assert read_grid(folder / "map.yaml").probability[0, 1] == 1.0
     wrong = runner.invoke(app, ["convert", str(folder / "carmen.log"), "-o", str(folder / "c.xyz")])
     assert isinstance(wrong.exception, InputError)

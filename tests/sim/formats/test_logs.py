@@ -207,7 +207,7 @@ def test_wean():
     grid = wean.read_grid(words(samples.wean_map()))
     np.testing.assert_array_equal(grid.values, [[np.nan, 0.5, 1.0], [0.0, 0.25, np.nan]])
     assert grid.cell_m == pytest.approx(0.1)
-    assert grid.occupancy[1, 0] == 1.0
+    assert grid.occupancy[1, 0] == grid.grid.probability[0, 1] == 1.0
 
 
 @pytest.mark.parametrize(
