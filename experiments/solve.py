@@ -202,7 +202,7 @@ def solve(
     if isinstance(estimator, GraphSlam):
         alone = _carried(_without_closures(estimator, path), T_base_logged)
         ties = np.array([(e.first, e.second) for e in estimator.graph.closures], int)
-        closures = estimator.node_stamps[ties.reshape(-1, 2)]
+        closures = estimator.map["stamps"][ties.reshape(-1, 2)]
     unused = unused_share(online) or 0.0
     row: Row = {"estimator": name, "unused_share": unused, **_counts(online, closures, lasers)}
     row |= _numbers(found)
@@ -251,7 +251,7 @@ def _carried(path: Estimate, T_base_other: Array) -> Estimate:
 
 def _without_closures(estimator: GraphSlam, path: Estimate) -> Estimate:
     """The path on key frames that are only chained, one to the next."""
-    nodes = np.searchsorted(estimator.node_stamps[1:], path.stamps, side="right")
+    nodes = np.searchsorted(estimator.map["stamps"][1:], path.stamps, side="right")
     in_key = se2.between(estimator.graph.poses[nodes], path.means)
     return dataclasses.replace(path, means=se2.compose(estimator.graph.chained()[nodes], in_key))
 

@@ -145,9 +145,9 @@ class GraphSlam(GraphSlamOptions):
         self._stamps, self._now = [math.nan], math.nan
 
     @property
-    def node_stamps(self) -> Array:
-        """(N,) s of the graph's nodes; NaN of the start."""
-        return np.array(self._stamps)
+    def map(self) -> dict[str, Any]:
+        """The graph, `stamps` (N,) s of its nodes, the start's NaN, and `closures`, its edges."""
+        return {"stamps": np.array(self._stamps), "closures": [*self.graph.closures]}
 
     def step(self, frame: Frame) -> Belief:
         """Move by the wheels; register a scan with the key frame; at a new one look for loops."""
@@ -194,7 +194,7 @@ class GraphSlam(GraphSlamOptions):
         ]
         path = [_symmetric(keys[placed.node].then(placed.in_key)) for placed in self._path]
         stamps = np.array([placed.stamp for placed in self._path])
-        return Estimate(stamps, *stack(path), kind="revised")
+        return Estimate(stamps, *stack(path), kind="revised", map=self.map)
 
     def _drop_misfits(self) -> None:
         """Let go of closures that the solved graph misses, where others hold its place."""

@@ -1,4 +1,4 @@
-"""Quality of a map: landmarks against the true ones; laser points against the walls; entropy."""
+"""Quality of a map: landmarks and closures against the true ones; points against walls; entropy."""
 
 import math
 from typing import Any
@@ -6,13 +6,17 @@ from typing import Any
 import numpy as np
 
 from estimators.base import Estimate
-from experiments.evaluation.metrics import alignment, rms
+from experiments.evaluation.metrics import alignment, rms, travelled_m
 from sim import se2
 from sim.arrays import Array
 from sim.recording import Recording
 from sim.sensors import Laser
 from sim.worlds.world import World
 
+FALSE_M, FALSE_RAD = 0.1, 0.03  # off the true motion, of a closure that is false
+_FALSE_SIGMAS = 4.0  # of its own noise
+_NEAR_M, _NEAR_RAD, _APART_M = 2.0, 0.8, 10.0  # of a revisit: to an old node; and path between
+_CLOSED_M = 5.0  # of path, within which a revisit is closed
 _CHUNK = 2000
 _LEAST_SIGMA_M = 1e-3  # points on one line have no spread across it
 
@@ -45,6 +49,46 @@ def landmark_errors(recording: Recording, made: Any) -> dict[str, float]:
         "n_landmarks": len(true),
         "map_rmse_m": rms(np.linalg.norm(found - true, axis=1)),
         "map_aligned_rmse_m": rms(np.linalg.norm(fitted - true, axis=1)),
+    }
+
+
+def closure_errors(recording: Recording, made: Any) -> dict[str, float]:
+    """Judge closures of a graph: how many there are, false ones, and how many revisits are closed.
+
+    A closure is false if it is off the true motion by more than `FALSE_M` or `FALSE_RAD`, and by
+    more than it claims to know: in a corridor it may know nothing along. A revisit is a node near
+    an old one in which the robot looks the same way; it is closed if a closure lies within 5 m of
+    path. Nothing for what is not a graph, and for a recording that was not simulated.
+
+    Parameters
+    ----------
+    made
+        An estimate's `map`: `stamps` (N,) s of nodes, the first one's NaN, and `closures`, edges.
+    """
+    world = recording.truth.world if recording.truth else None
+    if world is None or not isinstance(made, dict) or "closures" not in made:
+        return {}
+    closures = made["closures"]
+    true = recording.truth_at(np.nan_to_num(made["stamps"], nan=recording.frame_stamps[0]))
+    first, second = np.array([(e.first, e.second) for e in closures], int).reshape(-1, 2).T
+    motions = np.reshape([edge.motion.mean for edge in closures], (-1, 3))
+    noise = np.reshape([edge.motion.covariance for edge in closures], (-1, 3, 3))
+    off = se2.difference(se2.between(true[first], true[second]), motions)
+    squared = np.einsum("ki,ki->k", off, np.linalg.solve(noise, off[..., None])[..., 0])
+    false = (np.hypot(off[:, 0], off[:, 1]) > FALSE_M) | (np.abs(off[:, 2]) > FALSE_RAD)
+    false &= squared > _FALSE_SIGMAS**2
+    driven_m, revisits = travelled_m(true), []
+    for node in range(1, len(true)):
+        old = true[1:node][driven_m[node] - driven_m[1:node] > _APART_M]
+        away = np.abs(se2.between(old, true[node])).reshape(-1, 3)
+        if np.any((np.hypot(away[:, 0], away[:, 1]) < _NEAR_M) & (away[:, 2] < _NEAR_RAD)):
+            revisits.append(node)
+    apart_m = np.abs(driven_m[second] - driven_m[revisits, None])
+    return {
+        "closures": len(closures),
+        "false_closures": int(false.sum()),
+        "revisits": len(revisits),
+        "revisits_closed": int((apart_m < _CLOSED_M).any(axis=1).sum()),
     }
 
 

@@ -61,6 +61,12 @@ OF_THE_RUN = {
     "unused_share": Column(
         "share of scans or sightings not used", "unused", "", "linear", average=Average.PLAIN
     ),
+    "closures": Column("closures of loops", "closures", "", "linear", None, Average.PLAIN),
+    "false_closures": Column("false closures", "false", "", "linear", average=Average.PLAIN),
+    "revisits": Column("key frames at old places", "revisits", "", "linear", None, Average.PLAIN),
+    "revisits_closed": Column(
+        "key frames at old places that are closed", "closed", "", "linear", "higher", Average.PLAIN
+    ),
     "n_relations": Column("relations", "relations", "", "linear", None, Average.PLAIN),
     "worst_robot_rmse_m": Column("position RMSE of a team's worst robot", "worst robot", "m"),
     "n_sightings": Column("sightings of robots", "sightings", "", "linear", None, Average.PLAIN),

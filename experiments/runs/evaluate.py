@@ -23,7 +23,7 @@ from estimators.base import (
     since_start,
 )
 from estimators.team import run_team
-from experiments.evaluation.map_quality import landmark_errors
+from experiments.evaluation.map_quality import closure_errors, landmark_errors
 from experiments.evaluation.metrics import (
     LONGEST_GAP_S,
     SCORED_EXTRAS,
@@ -245,6 +245,7 @@ def score_run(
     scores: Row = {
         **score(recording, online, longest_gap_s, after_s),
         **landmark_errors(recording, made),
+        **closure_errors(recording, made),
     }
     own = score(recording, revised, longest_gap_s, after_s) if revised is not None else {}
     return scores | {f"{REVISED}{k}": v for k, v in own.items() if k not in OF_THE_RUN}

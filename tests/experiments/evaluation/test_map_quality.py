@@ -1,11 +1,15 @@
 """Maps of laser points: true poses give true maps, and wrong poses show."""
 
 import dataclasses
+import math
 
 import numpy as np
 import pytest
 
+from estimators.gaussian import Gaussian
+from estimators.graph.pose_graph import Edge
 from experiments.evaluation.map_quality import (
+    closure_errors,
     landmark_errors,
     map_points,
     mean_map_entropy,
@@ -68,3 +72,23 @@ def test_landmarks_are_compared_with_those_they_were_started_by():
     assert landmark_errors(recording, guessed)["map_rmse_m"] == pytest.approx(0.2)
     assert landmark_errors(recording, None) == {}
     assert landmark_errors(dataclasses.replace(recording, truth=None), made) == {}
+
+
+def test_a_closure_is_false_if_it_is_off_by_more_than_it_claims_to_know():
+    drive, k = circle(n_frames=700), 34  # nodes of a lap, and a little
+    stamps = drive.frame_stamps[::10]
+    true = drive.truth_at(stamps)
+    motion = se2.between(true[2], true[2 + k])
+    off = np.array([0.5, 0.0, 0.0])
+    sure, loose = np.diag([1e-4, 1e-4, 1e-6]), np.diag([100.0, 1e-4, 1e-6])
+    closures = [
+        Edge(2, 2 + k, Gaussian(motion, sure)),
+        Edge(2, 2 + k, Gaussian(motion + off, sure)),
+        Edge(2, 2 + k, Gaussian(motion + off, loose)),
+    ]
+    found = closure_errors(drive, {"stamps": np.r_[math.nan, stamps[1:]], "closures": closures})
+    assert found["closures"] == 3
+    assert found["false_closures"] == 1
+    assert 0 < found["revisits_closed"] < found["revisits"] <= len(stamps) - k + 1
+    assert closure_errors(drive, {"stamps": stamps, "closures": []})["revisits_closed"] == 0
+    assert closure_errors(drive, None) == {}
