@@ -165,6 +165,13 @@ def test_the_robot_waits_for_somebody_who_stays():
     assert driver.trouble == "collision"
 
 
+@pytest.mark.parametrize("x_m", [-0.05, 0.0])
+def test_somebody_who_touches_nearly_beside_or_behind_bars_no_way(x_m):
+    away_m = np.hypot(0.2, 0.15) + People().radius_m + 0.02  # the robot keeps 3 cm from those ahead
+    _, _, reached, _ = driven_at([x_m, np.sqrt(away_m**2 - x_m**2)], 5)
+    assert reached[-1] > 2.0
+
+
 def test_a_robot_that_has_waited_goes_past_somebody_beside_its_way():
     _, _, reached, _ = driven_at([2.0, 0.45], 30)
     assert reached[300 * 10] < 2.0
