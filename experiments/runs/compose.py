@@ -17,6 +17,7 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.core.object_type import ObjectType
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import ChoiceSweep, Override
+from hydra.errors import OverrideParseException
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import InterpolationKeyError, OmegaConfBaseException
 
@@ -35,7 +36,7 @@ from experiments.runs.schema import (
     value_at,
 )
 from experiments.runs.targets import named_code
-from sim.errors import InputError, describe_unknown, naming, require
+from sim.errors import InputError, describe_unknown, naming, printable, require
 from sim.files import read_text, sha256_of, write_text
 from sim.yaml_file import read_yaml
 
@@ -289,8 +290,16 @@ def compose_options(overrides: Sequence[str]) -> DictConfig:
 
 
 def parse_override(text: str) -> Override:
-    """One override of Hydra's grammar."""
-    (override,) = OverridesParser.create().parse_overrides([text])
+    """One override of Hydra's grammar; InputError if it is none."""
+    known = GlobalHydra.instance()  # knows which keys are groups
+    parser = OverridesParser.create(known.config_loader() if known.is_initialized() else None)
+    try:
+        (override,) = parser.parse_overrides([text])
+    except OverrideParseException as error:
+        raise InputError(
+            f"{printable(text)}: not KEY=VALUE; close all brackets and quotes, leave no item "
+            "empty, and put quotes round what holds other characters"
+        ) from error
     return override
 
 
@@ -471,7 +480,7 @@ def check_overrides(overrides: Sequence[str]) -> None:
             re.search(rf"\d{{{digits + 1}}}", text) is None,
             f"{text[:40]}...: a number of more than {digits} digits; shorten it",
         )
-    for override in OverridesParser.create().parse_overrides(list(overrides)):
+    for override in map(parse_override, overrides):
         key, value = override.key_or_group, override.value()
         require(key, f"{override.input_line}: no key before the =")
         if key == "hydra.searchpath" and isinstance(value, list):

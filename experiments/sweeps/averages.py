@@ -12,7 +12,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import pandas as pd
-import scipy
+import scipy.special
 
 from experiments.evaluation.statistics import paired_p
 from experiments.runs.columns import REPEAT, Average, average_of, title
@@ -101,7 +101,7 @@ def averages(
     with np.errstate(divide="ignore", invalid="ignore"):
         groups = (np.log(values) if geometric else values).groupby(level=list(range(len(by))))
         mean, n = groups.mean(), groups.size()
-        half = scipy.stats.t.ppf(0.975, n - 1) * groups.std() / np.sqrt(n.where(n >= MIN_UNITS))
+        half = scipy.special.stdtrit(n - 1, 0.975) * groups.std() / np.sqrt(n.where(n >= MIN_UNITS))
     means = pd.DataFrame({"value": mean, "low": mean - half, "high": mean + half})
     if geometric:
         return np.exp(means)

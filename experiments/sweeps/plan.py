@@ -18,8 +18,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from hydra.core.global_hydra import GlobalHydra
-from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override, RangeSweep
 from numpy.typing import NDArray
 from omegaconf import DictConfig, ListConfig, OmegaConf
@@ -28,6 +26,7 @@ from experiments.runs.compose import (
     Composed,
     Composer,
     open_composer,
+    parse_override,
     searched,
     set_value,
 )
@@ -244,7 +243,7 @@ def make_plan(arguments: Sequence[str], config_dir: str | None = None) -> Plan:
     """
     with open_composer([*searched(config_dir), *arguments]) as composer:
         arguments = composer.words
-        given = OverridesParser.create().parse_overrides(list(arguments))
+        given = [parse_override(text) for text in arguments]
         fixed = [o.input_line or "" for o in given if not o.is_sweep_override()]
         study = composer.compose(fixed)
         parts = []
@@ -277,10 +276,8 @@ def parse_swept(lines: Sequence[str]) -> dict[str, Sequence[Any]]:
     A plain number or truth value is given as such, a range of whole numbers as a range; what else
     there is, as the override's text.
     """
-    loader = GlobalHydra.instance()
-    parser = OverridesParser.create(loader.config_loader() if loader.is_initialized() else None)
     choices: dict[str, Sequence[Any]] = {}
-    for override in parser.parse_overrides(list(lines)):
+    for override in map(parse_override, lines):
         key = override.get_key_element()
         if override.is_delete():
             choices[key] = [override.input_line or key]

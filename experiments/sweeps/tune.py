@@ -295,6 +295,7 @@ def _problem(study: str, name: str, tuning: Tuning, config_dir: str | None) -> _
     )
     drives[0].check()
     options, ranges = drives[0].options_of("estimator"), tuning.estimators[name]
+    del options["_target_"]
     default: dict[str, Any] = {}
     for key, allowed in ranges.items():
         option, _, setting = key.partition(".")
