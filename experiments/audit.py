@@ -111,7 +111,7 @@ def audit(minutes: float, n_rows: int | None, seed: int) -> bool:
     tables = dict(_judged_tables())
     require(
         bool(tables),
-        f"{results() / 'tables'}: no judged tables; judge them, or audit in a clone",
+        f"{results() / 'tables'}: no judged tables; run it in a clone, whose results/ has them",
     )
     budget_s = 60.0 * minutes * (os.cpu_count() or 1) if n_rows is None else np.inf
     drawn = draw(tables, np.random.default_rng(seed), budget_s, n_rows)

@@ -146,8 +146,20 @@ class GraphSlam(GraphSlamOptions):
 
     @property
     def map(self) -> dict[str, Any]:
-        """The graph, `stamps` (N,) s of its nodes, the start's NaN, and `closures`, its edges."""
-        return {"stamps": np.array(self._stamps), "closures": [*self.graph.closures]}
+        """The graph: `stamps` (N,) s of its nodes, NaN of the start, and K closures.
+
+        Their nodes are `closures` (K, 2); `motions` (K, 3) and `covariances` (K, 3, 3) of the
+        second in the frame of the first.
+        """
+        edges = self.graph.closures
+        motions, covariances = stack([edge.motion for edge in edges])
+        nodes = np.array([(edge.first, edge.second) for edge in edges], np.int64)
+        return {
+            "stamps": np.array(self._stamps),
+            "closures": nodes.reshape(-1, 2),
+            "motions": motions,
+            "covariances": covariances,
+        }
 
     def step(self, frame: Frame) -> Belief:
         """Move by the wheels; register a scan with the key frame; at a new one look for loops."""

@@ -7,7 +7,7 @@ import tempfile
 from collections.abc import Callable, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Literal, cast
+from typing import Annotated, Literal, cast
 
 import numpy as np
 import orjson
@@ -49,7 +49,10 @@ class OfflineOptions(ProgramOptions):
     the files' names.
     """
 
-    settings: dict[str, float | int | str | bool] | None = None
+    settings: Annotated[
+        dict[str, int | float | str | bool] | None,
+        "a mapping of names to numbers, words or truth values",
+    ] = None
     """Further words KEY=VALUE of the command; null: none."""
     limit_s: Seconds = 600.0
     """Longest time that it may take, s."""
@@ -72,6 +75,14 @@ class OfflineOptions(ProgramOptions):
     def places(self) -> set[str]:
         """Names of files in the command."""
         return places_in(" ".join(self.words))
+
+    @property
+    def chosen(self) -> list[str]:
+        """The settings as words."""
+        return [
+            f"{key}={str(value).lower() if isinstance(value, bool) else value}"
+            for key, value in (self.settings or {}).items()
+        ]
 
     @property
     def needs(self) -> frozenset[str]:
@@ -111,8 +122,7 @@ class Offline(OfflineOptions):
         """Write the log, run the command, and read its trajectory."""
         with tempfile.TemporaryDirectory(prefix="estima-") as name:
             places = self._written(Path(name))
-            chosen = [f"{key}={value}" for key, value in (self.settings or {}).items()]
-            program = start([*(fill(word, places) for word in self.words), *chosen])
+            program = start([*(fill(word, places) for word in self.words), *self.chosen])
             try:
                 program.wait(self.limit_s)
             finally:

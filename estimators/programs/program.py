@@ -36,7 +36,9 @@ MRPT_PROGRAM, AMCL_PROGRAM = "build/peers/mrpt", "build/peers/amcl"
 _COMPILED = {MRPT_PROGRAM: "make peers", AMCL_PROGRAM: "make peers NAV2=FOLDER"}  # by what
 _TAIL = 2000  # bytes of its messages that are kept
 _CHUNK = 1 << 16
-_ERROR = re.compile(r"\w*(Error|Exception)\b")  # line of an error, which not all languages put last
+_SAID = 20  # lines of its messages, of which one is shown
+# Line of an error, which not all languages put last
+_ERROR = re.compile(r"[\w.]*(Error|Exception): |what\(\): |panic: |ERROR: |FATAL: ")
 _PATIENCE_S = 2.0  # to end by itself once its input is closed
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
@@ -300,7 +302,9 @@ class Program:
 
 def _telling(lines: Sequence[str]) -> str:
     """The line of a program's last words that says most: of an error, or else the last."""
-    return next((line for line in reversed(lines) if _ERROR.match(line.strip())), lines[-1])
+    return next(
+        (line for line in reversed(lines[-_SAID:]) if _ERROR.match(line.strip())), lines[-1]
+    )
 
 
 def start(words: Sequence[str]) -> Program:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from omegaconf import OmegaConf
 
-from experiments.cli.flags import find_own_code
+from experiments.cli.flags import check_once, find_own_code
 from experiments.runs.compose import open_composer, searched
 from experiments.runs.console import show
 from experiments.runs.experiment import Experiment
@@ -62,16 +62,8 @@ class CommandLine:
         require(not others, f"{' '.join(others)}: {known}")
         if given.config_dir is not None:
             find_own_code(Path(given.config_dir))
-        _check_once(given.overrides)
+        check_once(given.overrides)
         return cls(given.overrides, given.config_dir, given.cfg is not None, given.resolve)
-
-
-def _check_once(overrides: Sequence[str]) -> None:
-    """Refuse a key that is set twice, of which the second would count without a word."""
-    for one in overrides:
-        key = one.lstrip("+").partition("=")[0]
-        same = [other for other in overrides if other.lstrip("+").partition("=")[0] == key]
-        require(len(set(same)) == 1, f"{key} is set twice ({', '.join(same)}); leave one out")
 
 
 def run_arguments(arguments: Sequence[str], draw: Draw, out: Path | None = None) -> None:

@@ -19,11 +19,23 @@ PASS_ON = {
     "ignore_unknown_options": True,
     "help_option_names": ["-h", "--help"],
 }
+
+
+def check_once(overrides: list[str] | None) -> list[str] | None:
+    """Refuse a key that is set twice, of which the second would win silently."""
+    for one in overrides or []:
+        key = one.lstrip("+").partition("=")[0]
+        same = [o for o in overrides or [] if o.lstrip("+").partition("=")[0] == key]
+        require(len(set(same)) == 1, f"{key} is set twice ({', '.join(same)}); leave one out")
+    return overrides
+
+
 Overrides = Annotated[
     list[str] | None,
     typer.Argument(
         help="Hydra overrides, such as world=office seed=3.",
         autocompletion=completion.overrides,
+        callback=check_once,
     ),
 ]
 

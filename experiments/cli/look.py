@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from experiments.cli import completion
-from experiments.cli.flags import ConfigDir, Overrides
+from experiments.cli.flags import ConfigDir, Overrides, check_once
 from experiments.runs import columns, paths
 from experiments.runs.console import no_option, progress, show
 from sim.errors import nearest, require
@@ -144,7 +144,8 @@ def view(
     what: Annotated[
         list[str] | None,
         typer.Argument(
-            help="A recording or a log of any format, then Hydra overrides; or a sweep's NAME/KEY."
+            help="A recording or a log of any format, then Hydra overrides; or a sweep's NAME/KEY.",
+            callback=check_once,
         ),
     ] = None,
     estimate: Annotated[

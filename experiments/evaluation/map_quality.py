@@ -6,15 +6,16 @@ from typing import Any
 import numpy as np
 
 from estimators.base import Estimate
-from experiments.evaluation.metrics import alignment, rms, travelled_m
+from experiments.evaluation.metrics import LONGEST_GAP_S, alignment, rms, travelled_m
 from sim import se2
-from sim.arrays import Array
+from sim.arrays import Array, Bools
 from sim.recording import Recording
 from sim.sensors import Laser
 from sim.worlds.world import World
 
 FALSE_M, FALSE_RAD = 0.1, 0.03  # off the true motion, of a closure that is false
-_FALSE_SIGMAS = 4.0  # of its own noise
+_FALSE_SIGMAS, _LEAST_NOISE = 4.0, 1e-12  # of its own noise; added to that, which may be none
+_OF_A_GRAPH = {"stamps", "closures", "motions", "covariances"}
 _NEAR_M, _NEAR_RAD, _APART_M = 2.0, 0.8, 10.0  # of a revisit: to an old node; and path between
 _CLOSED_M = 5.0  # of path, within which a revisit is closed
 _CHUNK = 2000
@@ -52,44 +53,54 @@ def landmark_errors(recording: Recording, made: Any) -> dict[str, float]:
     }
 
 
-def closure_errors(recording: Recording, made: Any) -> dict[str, float]:
-    """Judge closures of a graph: how many there are, false ones, and how many revisits are closed.
+def closure_errors(
+    recording: Recording, made: Any, longest_gap_s: float = LONGEST_GAP_S
+) -> dict[str, float]:
+    """Judge closures of a graph: how many there are, false ones, and the share of revisits closed.
 
     A closure is false if it is off the true motion by more than `FALSE_M` or `FALSE_RAD`, and by
-    more than it claims to know: in a corridor it may know nothing along. A revisit is a node near
-    an old one in which the robot looks the same way; it is closed if a closure lies within 5 m of
-    path. Nothing for what is not a graph, and for a recording that was not simulated.
+    more than it claims: along a bare corridor it may claim nothing. A revisit is a node near an old
+    one in which the robot looks the same way; it is closed if a closure lies within 5 m of path.
+    Only what happens while the truth is known counts. Nothing for what is not a graph, and for a
+    recording that was not simulated.
 
     Parameters
     ----------
     made
-        An estimate's `map`: `stamps` (N,) s of nodes, the first one's NaN, and `closures`, edges.
+        An estimate's `map`: `stamps` (N,) s of nodes, NaN of the first, `closures` (K, 2) nodes,
+        and their `motions` (K, 3) and `covariances` (K, 3, 3).
+    longest_gap_s
+        As for `experiments.evaluation.metrics.score`.
     """
     world = recording.truth.world if recording.truth else None
-    if world is None or not isinstance(made, dict) or "closures" not in made:
+    if world is None or not isinstance(made, dict) or not made.keys() >= _OF_A_GRAPH:
         return {}
-    closures = made["closures"]
-    true = recording.truth_at(np.nan_to_num(made["stamps"], nan=recording.frame_stamps[0]))
-    first, second = np.array([(e.first, e.second) for e in closures], int).reshape(-1, 2).T
-    motions = np.reshape([edge.motion.mean for edge in closures], (-1, 3))
-    noise = np.reshape([edge.motion.covariance for edge in closures], (-1, 3, 3))
-    off = se2.difference(se2.between(true[first], true[second]), motions)
+    stamps = np.nan_to_num(made["stamps"], nan=recording.frame_stamps[0])
+    true = recording.truth_at(stamps, longest_gap_s)
+    known: Bools = np.isfinite(true).all(axis=1)
+    path = recording.known_truth
+    driven_m = np.interp(stamps, path.stamps, travelled_m(path.poses))
+    first, second = made["closures"].T
+    off = se2.difference(se2.between(true[first], true[second]), made["motions"])
+    noise = made["covariances"] + _LEAST_NOISE * np.eye(3)
     squared = np.einsum("ki,ki->k", off, np.linalg.solve(noise, off[..., None])[..., 0])
     false = (np.hypot(off[:, 0], off[:, 1]) > FALSE_M) | (np.abs(off[:, 2]) > FALSE_RAD)
     false &= squared > _FALSE_SIGMAS**2
-    driven_m, revisits = travelled_m(true), []
-    for node in range(1, len(true)):
-        old = true[1:node][driven_m[node] - driven_m[1:node] > _APART_M]
+    revisits = []
+    for node in np.flatnonzero(known[1:]) + 1:
+        old = true[1:node][known[1:node] & (driven_m[node] - driven_m[1:node] > _APART_M)]
         away = np.abs(se2.between(old, true[node])).reshape(-1, 3)
         if np.any((np.hypot(away[:, 0], away[:, 1]) < _NEAR_M) & (away[:, 2] < _NEAR_RAD)):
             revisits.append(node)
-    apart_m = np.abs(driven_m[second] - driven_m[revisits, None])
-    return {
-        "closures": len(closures),
+    found: dict[str, float] = {
+        "closures": len(false),
         "false_closures": int(false.sum()),
         "revisits": len(revisits),
-        "revisits_closed": int((apart_m < _CLOSED_M).any(axis=1).sum()),
     }
+    if not revisits:
+        return found
+    apart_m = np.abs(driven_m[second] - driven_m[revisits, None])
+    return {**found, "revisits_closed": float((apart_m < _CLOSED_M).any(axis=1).mean())}
 
 
 def map_points(

@@ -62,10 +62,17 @@ OF_THE_RUN = {
         "share of scans or sightings not used", "unused", "", "linear", average=Average.PLAIN
     ),
     "closures": Column("closures of loops", "closures", "", "linear", None, Average.PLAIN),
-    "false_closures": Column("false closures", "false", "", "linear", average=Average.PLAIN),
+    "false_closures": Column(
+        "false closures", "false closures", "", "linear", average=Average.PLAIN
+    ),
     "revisits": Column("key frames at old places", "revisits", "", "linear", None, Average.PLAIN),
     "revisits_closed": Column(
-        "key frames at old places that are closed", "closed", "", "linear", "higher", Average.PLAIN
+        "share of revisits that are closed",
+        "revisits closed",
+        "",
+        "linear",
+        "higher",
+        Average.PLAIN,
     ),
     "n_relations": Column("relations", "relations", "", "linear", None, Average.PLAIN),
     "worst_robot_rmse_m": Column("position RMSE of a team's worst robot", "worst robot", "m"),

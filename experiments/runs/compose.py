@@ -353,10 +353,9 @@ def searched(config_dir: str | Path | None) -> list[str]:
     require(folder.is_dir(), f"{config_dir}: no such folder of options")
     require("${" not in str(folder), f"{folder}: Hydra takes ${{ for a value; rename the folder")
     groups = (*GROUPS, "study")
-    require(
-        any((folder / group).is_dir() for group in groups) or not any(folder.glob("*.yaml")),
-        f"{config_dir}: its options lie in no group; an estimator's goes to {config_dir}/estimator",
-    )
+    for path in folder.glob("*.yaml"):
+        if re.search(r"^_target_:", read_text(path), re.M):
+            raise InputError(f"{path}: an option lies in the folder of its group, as estimator/")
     for group in groups:
         for path in sorted((folder / group).rglob("*.yaml")):
             _check_option(path)

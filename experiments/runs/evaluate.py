@@ -245,7 +245,7 @@ def score_run(
     scores: Row = {
         **score(recording, online, longest_gap_s, after_s),
         **landmark_errors(recording, made),
-        **closure_errors(recording, made),
+        **closure_errors(recording, made, longest_gap_s),
     }
     own = score(recording, revised, longest_gap_s, after_s) if revised is not None else {}
     return scores | {f"{REVISED}{k}": v for k, v in own.items() if k not in OF_THE_RUN}

@@ -31,8 +31,8 @@ class Range:
         tuple[Scalar, ...], Strict(False), Field(min_length=2), "a list of two plain values or more"
     ] = ()
     """The values of a choice."""
-    default: Scalar = None
-    """Value unless set, where the option's own file does not say: that of a program's setting."""
+    default: Any = None
+    """Of a program's setting: the value that the program takes if none is given."""
 
     def __post_init__(self) -> None:
         require(

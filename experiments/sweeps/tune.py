@@ -184,6 +184,15 @@ def write(tuned: TuningResult, study: str, tuning: Tuning, folder: Path) -> Path
     return path
 
 
+def with_values(experiment: Experiment, values: Mapping[str, Any]) -> Experiment:
+    """An experiment with values of its estimator by key; its other settings are kept."""
+    options = nested(values)
+    for option, settings in options.items():
+        if isinstance(settings, dict):
+            options[option] = {**(experiment.option(option) or {}), **settings}
+    return experiment.with_estimator(**options)
+
+
 def nested(values: Mapping[str, Any]) -> dict[str, Any]:
     """Values by key as options: `settings.width` is a key of the option `settings`."""
     options: dict[str, Any] = {}
@@ -298,14 +307,20 @@ def _problem(study: str, name: str, tuning: Tuning, config_dir: str | None) -> _
     del options["_target_"]
     default: dict[str, Any] = {}
     for key, allowed in ranges.items():
-        option, _, setting = key.partition(".")
+        option, dot, setting = key.partition(".")
         require(option in options, f"{name} has no option {key}; it has {', '.join(options)}")
-        stated = (options[option] or {}) if setting else options
-        default[key] = stated.get(setting or key, allowed.default)
+        where = f"tune.estimators.{name}.{key}"
+        stated = (options[option] or {}) if dot else options
+        require(isinstance(stated, dict), f"{where}: {option} has no settings; leave out the dot")
+        known = bool(dot) and setting not in stated
+        require(not dot or setting, f"{where}: name the setting after the dot")
+        remedy = "give the default, by which the program runs"
+        remedy = remedy if known else "leave out the default, which the option's file states"
+        require(known == (allowed.default is not None), f"{where}: {remedy}")
+        default[key] = allowed.default if known else stated[setting or key]
         require(
             allowed.has(default[key]),
-            f"tune.estimators.{name}.{key} must hold the default, {default[key]!r}, so that it is "
-            "a trial too",
+            f"{where} must hold the default, {default[key]!r}, so that it is a trial too",
         )
     return _Problem(name, tuning.trials, ranges, drives, judged, default)
 
@@ -339,8 +354,7 @@ def _judged(
     key = json.dumps([_digest(judged, {}), values], sort_keys=True)
     kept: dict[str, list[float]] = study.user_attrs.get("judged", {})
     if key not in kept:
-        options = nested(values)
-        runs = (delayed(error_m)(experiment.with_estimator(**options)) for experiment in judged)
+        runs = (delayed(error_m)(with_values(experiment, values)) for experiment in judged)
         kept = {**kept, key: list(Parallel(n_jobs=jobs)(runs))}
         study.set_user_attr("judged", kept)
     return kept[key]
@@ -365,7 +379,7 @@ def _mean_log_error(trial: Any, problem: _Problem) -> float:
     values = {name: _suggested(trial, name, allowed) for name, allowed in problem.ranges.items()}
     logs = []
     for i, experiment in enumerate(problem.drives):
-        logs.append(math.log(error_m(experiment.with_estimator(**nested(values)))))
+        logs.append(math.log(error_m(with_values(experiment, values))))
         trial.report(logs[-1], i)
         if i + 1 < len(problem.drives) and trial.should_prune():
             raise _optuna().TrialPruned

@@ -151,7 +151,11 @@ def convert_log(
     """
     _check_output(log, out)
     if out.suffix == ".yaml":
-        require(len(log) == 1, f"{log[0]}: a map is one file, got {len(log)}")
+        require(
+            len(log) == 1 and robot is None and topic is None and part == WHOLE,
+            f"{out}: a map is made of one file, without options; that of a log's scans by "
+            f"estima map LOG -o {out}",
+        )
         grid = read_map(log[0]).grid
         write_grid(grid, out, "raw")
         rows, columns = grid.probability.shape

@@ -124,7 +124,7 @@ def read_grid(source: Path | Words) -> Grid:
         n_x, n_y = words.finite(np.array([line]), 1, 2, "the map's size")[0].astype(int).tolist()
     require(
         0 < n_x <= _MOST_CELLS and 0 < n_y <= _MOST_CELLS and 0.0 < cell_m < 100.0,
-        f"{where}: no `global_map[0]: width height` of a map in it",
+        f"{where}: no `global_map[0]: width height` of a map in it; `estima map` maps a log",
     )
     begin = words.first[line + 1]
     cells = words.values[begin:]

@@ -87,7 +87,7 @@ class GivingWay:
                 off = math.cos(pose[2]) * offsets[:, 1] - math.sin(pose[2]) * offsets[:, 0]
                 beside_m = np.abs(off) - self._half_width_m - self._crowd.people.radius_m
                 counts &= beside_m <= _BESIDE_M
-        room_m = np.maximum(gaps - _BESIDE_M - kept_off_m * nearing, 0.0)
+        room_m = np.maximum(gaps - (_BESIDE_M + kept_off_m) * nearing, 0.0)
         most = np.sqrt(2.0 * self._brake_mps2 * room_m)
         return float(np.min(most[counts] / speeds[counts], initial=1.0))
 

@@ -100,7 +100,9 @@ def rows_apart(*overrides):
 
 
 @pytest.mark.slow  # processes that load compiled code
-@pytest.mark.parametrize("name", ["odometry", "ekf_icp", "mcl", "ekf_slam", "fastslam", "smoother"])
+@pytest.mark.parametrize(
+    "name", ["odometry", "ekf_icp", "mcl", "ekf_slam", "fastslam", "smoother", "graph_slam"]
+)
 def test_results_are_those_of_this_process(name):
     given = f"estimator={name}", "keep=[particles]"
     rows_of(*given)  # so that compiled code is on disk

@@ -166,6 +166,14 @@ BAD = {
         "sys.stderr.write('TypeError: no x\\n    at mine.js:3\\n\\nNode.js v18\\n'); sys.exit(1)",
         "ended with code 1: TypeError: no x",
     ),
+    "warned": (
+        "sys.stderr.write('Error tolerance is 1e-3\\nmine: no scans in log.log\\n'); sys.exit(3)",
+        "ended with code 3: mine: no scans in log.log",
+    ),
+    "what": (
+        "sys.stderr.write('  what():  out of range\\nAborted (core dumped)\\n'); sys.exit(1)",
+        r"ended with code 1: +what\(\):  out of range",
+    ),
     "two_lines": (f"print('{_BELIEF}\\n{_BELIEF}', flush=True)", "after its answer|being asked"),
     "greeting": ("print('hello\\n{}', flush=True)", "after its answer 'hello'|being asked"),
     "far": ("print('{\"mean\": [1e300, 0, 0]}', flush=True)", r"mean, numbers up to 1e\+12"),

@@ -6,8 +6,6 @@ import math
 import numpy as np
 import pytest
 
-from estimators.gaussian import Gaussian
-from estimators.graph.pose_graph import Edge
 from experiments.evaluation.map_quality import (
     closure_errors,
     landmark_errors,
@@ -81,14 +79,24 @@ def test_a_closure_is_false_if_it_is_off_by_more_than_it_claims_to_know():
     motion = se2.between(true[2], true[2 + k])
     off = np.array([0.5, 0.0, 0.0])
     sure, loose = np.diag([1e-4, 1e-4, 1e-6]), np.diag([100.0, 1e-4, 1e-6])
-    closures = [
-        Edge(2, 2 + k, Gaussian(motion, sure)),
-        Edge(2, 2 + k, Gaussian(motion + off, sure)),
-        Edge(2, 2 + k, Gaussian(motion + off, loose)),
-    ]
-    found = closure_errors(drive, {"stamps": np.r_[math.nan, stamps[1:]], "closures": closures})
+    graph = {
+        "stamps": np.r_[math.nan, stamps[1:]],
+        "closures": np.tile([2, 2 + k], (3, 1)),
+        "motions": motion + np.outer([0.0, 1.0, 1.0], off),
+        "covariances": np.array([sure, sure, loose]),
+    }
+    found = closure_errors(drive, graph)
     assert found["closures"] == 3
     assert found["false_closures"] == 1
-    assert 0 < found["revisits_closed"] < found["revisits"] <= len(stamps) - k + 1
-    assert closure_errors(drive, {"stamps": stamps, "closures": []})["revisits_closed"] == 0
-    assert closure_errors(drive, None) == {}
+    assert 0 < found["revisits"] <= len(stamps) - k + 1
+    assert 0.0 < found["revisits_closed"] < 1.0
+    none = {name: values[:0] for name, values in graph.items() if name != "stamps"}
+    assert closure_errors(drive, graph | none)["revisits_closed"] == 0.0
+    early = drive.truth.stamps < stamps[2 + k] - 0.5  # the truth ends before the closures do
+    truth = dataclasses.replace(
+        drive.truth, stamps=drive.truth.stamps[early], poses=drive.truth.poses[early]
+    )
+    unknown = closure_errors(dataclasses.replace(drive, truth=truth), graph)
+    assert unknown["false_closures"] == 0
+    assert "revisits_closed" not in unknown or unknown["revisits"] > 0
+    assert closure_errors(drive, None) == closure_errors(drive, {"closures": []}) == {}

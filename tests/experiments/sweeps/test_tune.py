@@ -17,7 +17,7 @@ import yaml
 
 import experiments.sweeps.tune as tuning
 from experiments.runs.experiment import Experiment
-from experiments.sweeps.ranges import Tuning
+from experiments.sweeps.ranges import Range, Tuning
 from sim.errors import InputError
 from sim.options import build
 
@@ -193,6 +193,47 @@ def test_what_does_not_fit_the_estimator_is_told_before_any_run(study, tmp_path)
 def test_settings_of_a_program_are_options_of_an_option():
     values = {"settings.width": 0.1, "settings.beams": 20, "kind": "online"}
     assert tuning.nested(values) == {"settings": {"width": 0.1, "beams": 20}, "kind": "online"}
+
+
+def test_other_settings_of_a_program_are_kept(monkeypatch):
+    experiment = Experiment.compose(
+        [
+            "estimator=offline",
+            "estimator.command=['true','{out}']",
+            "estimator.settings={a: 1, w: 2}",
+        ]
+    )
+    changed = tuning.with_values(experiment, {"settings.w": 3, "kind": "online"})
+    assert changed.option("settings") == {"a": 1, "w": 3}
+    assert changed.option("kind") == "online"
+
+
+@pytest.mark.parametrize(
+    ("line", "complaint"),
+    [
+        ("settings.w: { interval: [1, 3] }", "settings.w: give the default"),
+        ("settings.a: { interval: [1, 3], default: 2 }", "settings.a: leave out the default"),
+        ("settings.w: { interval: [1, 3], default: 5 }", "must hold the default, 5"),
+        ("limit_s.w: { interval: [1, 3], default: 2 }", "limit_s has no settings"),
+        ("settings.: { interval: [1, 3], default: 2 }", "name the setting after the dot"),
+        ("limit_s: { interval: [1.0, 900.0], default: 2.0 }", "leave out the default"),
+    ],
+)
+def test_wrong_ranges_of_settings_are_told(line, complaint, tmp_path):
+    folder = tmp_path / "study"
+    folder.mkdir()
+    text = STUDY.format(trials=2, judged=1000, end=1002).replace("odometry:\n", "offline:\n")
+    text = text.replace("/estimator: odometry", "/estimator: offline")
+    head, _, tail = text.partition("      window_s")
+    ranges = f"      {line}\nhydra" + tail.partition("hydra")[2]
+    given = "estimator:\n  command: ['true', '{out}']\n  settings: { a: 1 }\nroute:"
+    (folder / "toy.yaml").write_text((head + ranges).replace("route:", given, 1))
+    with pytest.raises(InputError, match=complaint):
+        list(tuning.tune("toy", config_dir=str(tmp_path)))
+
+
+def test_whole_defaults_stay_whole():
+    assert type(build(Range, {"interval": [1, 9], "default": 5}, "range").default) is int
 
 
 @pytest.mark.parametrize("source", ["mrpt.cpp", "amcl.cpp"])
