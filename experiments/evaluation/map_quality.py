@@ -8,7 +8,7 @@ import numpy as np
 from estimators.base import Estimate
 from experiments.evaluation.metrics import LONGEST_GAP_S, alignment, rms, travelled_m
 from sim import se2
-from sim.arrays import Array, Bools
+from sim.arrays import Array
 from sim.recording import Recording
 from sim.sensors import Laser
 from sim.worlds.world import World
@@ -77,7 +77,7 @@ def closure_errors(
         return {}
     stamps = np.nan_to_num(made["stamps"], nan=recording.frame_stamps[0])
     true = recording.truth_at(stamps, longest_gap_s)
-    known: Bools = np.isfinite(true).all(axis=1)
+    known = np.asarray(np.isfinite(true).all(axis=1))
     path = recording.known_truth
     driven_m = np.interp(stamps, path.stamps, travelled_m(path.poses))
     first, second = made["closures"].T
