@@ -243,5 +243,5 @@ def test_the_command_says_what_came_out(monkeypatch, capsys):
         with pytest.raises(InputError, match="must be positive"):
             module.audit(minutes, rows, seed=0)
     monkeypatch.setattr(module, "_judged_tables", lambda: [])
-    with pytest.raises(InputError, match="no judged tables; run `make reproduce FULL=1`"):
+    with pytest.raises(InputError, match="no judged tables; run it in a clone"):
         module.audit(1.0, None, seed=0)

@@ -70,7 +70,7 @@ def test_without_a_known_start_only_what_has_a_map_fits(monkeypatch):
 def test_wrong_overrides_are_refused():
     with pytest.raises(InputError, match="leave the estimator out"):
         recommend(["estimator=mcl"])
-    with pytest.raises(InputError, match="leave the recording out: state its robot and sensors"):
+    with pytest.raises(InputError, match="leave the recording out: say what it was made with"):
         recommend(["recording=a.npz"])
     with pytest.raises(InputError, match=r"robot\.kr must be"):
         recommend(["robot.kr=-1.0"])
