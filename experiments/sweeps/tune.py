@@ -312,12 +312,17 @@ def _problem(study: str, name: str, tuning: Tuning, config_dir: str | None) -> _
         where = f"tune.estimators.{name}.{key}"
         stated = (options[option] or {}) if dot else options
         require(isinstance(stated, dict), f"{where}: {option} has no settings; leave out the dot")
-        known = bool(dot) and setting not in stated
+        of_program = bool(dot) and setting not in stated
         require(not dot or setting, f"{where}: name the setting after the dot")
-        remedy = "give the default, by which the program runs"
-        remedy = remedy if known else "leave out the default, which the option's file states"
-        require(known == (allowed.default is not None), f"{where}: {remedy}")
-        default[key] = allowed.default if known else stated[setting or key]
+        require(
+            not of_program or allowed.default is not None,
+            f"{where}: give the default, with which the program runs",
+        )
+        require(
+            of_program or allowed.default is None,
+            f"{where}: leave out the default, which the option's file states",
+        )
+        default[key] = allowed.default if of_program else stated[setting or key]
         require(
             allowed.has(default[key]),
             f"{where} must hold the default, {default[key]!r}, so that it is a trial too",

@@ -290,7 +290,8 @@ def test_a_damaged_figure_is_named(tmp_path, results):
             contents.write_report(tmp_path)
     path.unlink()
     path.mkdir()
-    with pytest.raises(InputError, match=r"gil2008_8\.png: not a file; name a file in it, or remove it"):
+    said = r"gil2008_8\.png: not a file; name a file in it, or remove it"
+    with pytest.raises(InputError, match=said):
         contents.write_report(tmp_path)
 
 
