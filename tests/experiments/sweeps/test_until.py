@@ -213,7 +213,8 @@ def test_against_goes_with_a_sweep():
 @pytest.mark.slow
 def test_a_sweep_ends_when_it_is_decided_and_goes_on_where_it_was(name):
     """Real runs: the arm that believes another track errs more, and 8 seeds are saved."""
-    arguments = ["run", "-m", *ALONE, "route=angular_4", "estimator=odometry",
+    route = [a.replace("linear_1", "angular_4") for a in ALONE]
+    arguments = ["run", "-m", *route, "estimator=odometry",
                  "prior.track_m=0.19,0.3", "seed=range(0,20)", "until=decided:heading_rmse_rad",
                  f"name={name}"]  # fmt: skip
     done = called(*arguments)
