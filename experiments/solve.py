@@ -201,8 +201,7 @@ def solve(
     alone, closures = None, np.zeros((0, 2))
     if isinstance(estimator, GraphSlam):
         alone = _carried(_without_closures(estimator, path), T_base_logged)
-        ties = np.array([(e.first, e.second) for e in estimator.graph.closures], int)
-        closures = estimator.map["stamps"][ties.reshape(-1, 2)]
+        closures = estimator.map["stamps"][estimator.map["closures"]]
     unused = unused_share(online) or 0.0
     row: Row = {"estimator": name, "unused_share": unused, **_counts(online, closures, lasers)}
     row |= _numbers(found)

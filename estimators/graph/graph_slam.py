@@ -43,7 +43,7 @@ from estimators.graph.loop_closing import (
     certain,
     within_gate,
 )
-from estimators.graph.pose_graph import Edge, PoseGraph
+from estimators.graph.pose_graph import Edge, PoseGraph, stacked
 from estimators.graph.residual_noise import ResidualNoise
 from estimators.laser.icp import PreparedScan
 from estimators.laser.scan_matching import (
@@ -151,12 +151,10 @@ class GraphSlam(GraphSlamOptions):
         Their nodes are `closures` (K, 2); `motions` (K, 3) and `covariances` (K, 3, 3) of the
         second in the frame of the first.
         """
-        edges = self.graph.closures
-        motions, covariances = stack([edge.motion for edge in edges])
-        nodes = np.array([(edge.first, edge.second) for edge in edges], np.int64)
+        first, second, motions, covariances = stacked(self.graph.closures)
         return {
             "stamps": np.array(self._stamps),
-            "closures": nodes.reshape(-1, 2),
+            "closures": np.column_stack([first, second]),
             "motions": motions,
             "covariances": covariances,
         }

@@ -128,7 +128,7 @@ class PoseGraph:
 
         Edges of the graph itself must not be among them.
         """
-        first, second, measured, noise = _stacked(edges)
+        first, second, measured, noise = stacked(edges)
         nodes, places = np.unique(np.concatenate([first, second]), return_inverse=True)
         by_first, by_second = se2.between_jacobians(self.poses[first], self.poses[second])
         J = np.zeros((len(edges), 3, len(nodes), 3))
@@ -174,7 +174,7 @@ class PoseGraph:
 
     def misses(self, edges: list[Edge] | None = None) -> Array:
         """Mahalanobis distances (K,) of edges from the graph, by their own noise; of closures."""
-        first, second, measured, noise = _stacked(self.closures if edges is None else edges)
+        first, second, measured, noise = stacked(self.closures if edges is None else edges)
         off = se2.difference(measured, se2.between(self.poses[first], self.poses[second]))
         return np.asarray(np.sqrt(np.sum(times(whitening_of(noise), off) ** 2, axis=1)))
 
@@ -210,7 +210,7 @@ class PoseGraph:
 
     def _problem(self) -> Problem:
         edges = self._chain + self.closures
-        first, second, motions, covariances = _stacked(edges)
+        first, second, motions, covariances = stacked(edges)
         return Problem(
             prior_mean=self._start.mean,
             prior_covariance=self._start.covariance,
@@ -222,7 +222,7 @@ class PoseGraph:
         )
 
 
-def _stacked(edges: list[Edge]) -> tuple[Ints, Ints, Array, Array]:
+def stacked(edges: list[Edge]) -> tuple[Ints, Ints, Array, Array]:
     """First and second node (E,), motions (E, 3) and covariances (E, 3, 3)."""
     ends = np.array([(edge.first, edge.second) for edge in edges], np.int64).reshape(-1, 2)
     return ends[:, 0], ends[:, 1], *stack([edge.motion for edge in edges])

@@ -352,11 +352,10 @@ def searched(config_dir: str | Path | None) -> list[str]:
     folder = Path(config_dir).resolve()
     require(folder.is_dir(), f"{config_dir}: no such folder of options")
     require("${" not in str(folder), f"{folder}: Hydra takes ${{ for a value; rename the folder")
-    groups = (*GROUPS, "study")
     for path in folder.glob("*.yaml"):
         if re.search(r"^_target_:", read_text(path), re.M):
             raise InputError(f"{path}: an option lies in the folder of its group, as estimator/")
-    for group in groups:
+    for group in (*GROUPS, "study"):
         for path in sorted((folder / group).rglob("*.yaml")):
             _check_option(path)
     return [f"{_SEARCHED}[{paths.quoted(f'file://{folder}')}]"]
