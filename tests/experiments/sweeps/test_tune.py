@@ -220,6 +220,7 @@ def test_other_settings_of_a_program_are_kept(monkeypatch):
     ],
 )
 def test_wrong_ranges_of_settings_are_told(line, complaint, tmp_path):
+    pytest.importorskip("optuna")
     folder = tmp_path / "study"
     folder.mkdir()
     text = STUDY.format(trials=2, judged=1000, end=1002).replace("odometry:\n", "offline:\n")
