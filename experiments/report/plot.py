@@ -77,7 +77,7 @@ def sweep_figure(
 
     A y such as `answer_ate_rmse_m` is that of the best answer, the revised path where there is one;
     what gives revised paths is marked so. Means follow the rule of `sweeps.averages`, as those of
-    tables do. A dotted line is what no method can beat, where rows state it (docs/do/bound.md).
+    tables do. A dotted line is the bound, where rows state it (docs/do/bound.md).
 
     Parameters
     ----------

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -22,7 +22,8 @@ from sim.errors import require
 
 Setting = dict[str, Any]
 _ERROR = "answer_ate_rmse_m"
-_ALWAYS = ("world", "robot.kr", "robot.kl", "route.distance_m")  # compared for every estimator
+_ALWAYS = ("world", "robot.kr", "robot.kl", "route.distance_m", "people.n")  # always compared
+_WITHOUT_IDS = "estimator.association=mahalanobis"
 _MOST_CHANGES, _MOST_SHOWN, _MOST_TRIED = 6, 8, 4
 _TUNED = "_tuned"
 _COMPOSED = 0.7  # share of the time that goes to the estimators; the rest, to the tables
@@ -70,12 +71,15 @@ class Candidate:
         What it needs and does not get, in words.
     installed
         Whether its package is there.
+    associates
+        Whether it finds out itself which landmark is which, since the sensor does not tell.
     """
 
     option: str
     experiment: Experiment
     missing: Sequence[str] = ()
     installed: bool = True
+    associates: bool = False
 
     @property
     def name(self) -> str:
@@ -129,6 +133,8 @@ def recommend(
     if absent:
         lines.append(f"Not installed, but would fit: {', '.join(absent)}.")
     lines.append("")
+    if any(each.associates for each in fits):
+        lines += [f"Landmarks without ids need {_WITHOUT_IDS}; the errors below are with ids.", ""]
     for found in nearest:
         lines += found.lines(fits, shown)
         shown.update(found.rows)
@@ -151,14 +157,24 @@ def _candidates(
         experiment = Experiment(*composer.compose(asked).resolve())
         if experiment.lacks_program:
             continue
-        missing = experiment.missing()
+        missing, blind = experiment.missing(), _without_ids(experiment)
+        associates = bool(blind) and "association" in experiment.options_of("estimator")
+        if blind and not associates:
+            missing = [*missing, f"landmarks with ids ({blind}=true)"]
         try:
             if not missing:
                 experiment.check()
         except MissingPackageError:
-            yield Candidate(option, experiment, installed=False)
+            yield Candidate(option, experiment, installed=False, associates=associates)
         else:
-            yield Candidate(option, experiment, missing)
+            yield Candidate(option, experiment, missing, associates=associates)
+
+
+def _without_ids(experiment: Experiment) -> str:
+    """Key of a camera that the estimator reads and that does not tell landmarks apart, if any."""
+    setting = _setting(experiment)
+    keys = (f"sensors.{name}.identifies" for name in experiment.sensors_needed())
+    return next((key for key in keys if setting.get(key) is False), "")
 
 
 # What was measured
@@ -273,10 +289,10 @@ class Nearest:
         """Geometric mean of each estimator's errors, m, the least first."""
         return sorted((_mean(r.error_m for r in rows), name) for name, rows in self.rows.items())
 
-    def lines(self, fits: Sequence[Candidate], shown: Collection[str]) -> list[str]:
-        """What the setting differs in, and the best estimators that no nearer table has."""
-        errors = [(error, name) for error, name in self.errors() if name not in shown]
-        if not errors:
+    def lines(self, fits: Sequence[Candidate], shown: set[str]) -> list[str]:
+        """What the setting differs in, and the best estimators, if a nearer table lacks some."""
+        errors = self.errors()
+        if shown.issuperset(self.rows):
             return []
         ordered = sorted(self.changes.items(), key=lambda change: -change[1][2])
         said = [
@@ -359,7 +375,9 @@ def _to_be_sure(
     overrides: Sequence[str], fits: Sequence[Candidate], nearest: Sequence[Nearest]
 ) -> list[str]:
     """Arguments of a sweep of the best ones, on seeds that nothing was tuned on."""
-    options = {each.name: each.option for each in fits if each.installed}
+    associating = any(each.associates for each in fits)
+    able = [each for each in fits if each.installed and each.associates >= associating]
+    options = {each.name: each.option for each in able}
     ranked = [name for found in nearest for _, name in found.errors() if name in options]
     best: dict[str, str] = {}  # of a method and its tuned variant
     for name in [*ranked, *options]:
@@ -367,6 +385,7 @@ def _to_be_sure(
     tried = [*best.values()][:_MOST_TRIED]
     exact = any(override.startswith("simulation.") for override in overrides)
     words = [*overrides, *([] if exact else ["simulation.rays=exact"])]
+    words += [_WITHOUT_IDS] * associating
     words += [f"estimator={','.join(tried)}", "seed=range(1000,1010)", f"name={SURE}"]
     return words
 

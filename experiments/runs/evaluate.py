@@ -135,7 +135,7 @@ def evaluate(
 
 
 def _bounds(experiment: Experiment, read: Team, revised: Sequence[bool]) -> list[Row]:
-    """Columns of what no method can beat, of each robot."""
+    """Columns of the bound, of each robot."""
     settings, names = experiment.config["estimator"], list(read.robots[0].sensors)
     if is_ours(settings) and "programs" not in settings["_target_"]:  # others may read all
         names = [name for name in names if name in settings.values()]

@@ -67,6 +67,23 @@ def test_without_a_known_start_only_what_has_a_map_fits(monkeypatch):
     assert "estimator=mcl" in sweep
 
 
+def test_landmarks_without_ids_need_a_method_that_associates(monkeypatch):
+    monkeypatch.setattr(paths, "option_names", lambda group: ["ekf_slam", "odometry", "smoother"])
+    text, sweep = recommend(["sensors=stereo_pixel", "sensors.stereo.identifies=false"])
+    assert "Fits: ekf_slam, odometry." in text
+    assert "Needs landmarks with ids (sensors.stereo.identifies=true): smoother." in text
+    assert "the errors below are with ids" in text
+    assert "estimator.association=mahalanobis" in sweep
+    assert "estimator=ekf_slam" in sweep
+    assert "association" not in recommend(["sensors=stereo_pixel"]).text
+
+
+def test_people_count_in_the_distance(monkeypatch):
+    monkeypatch.setattr(paths, "option_names", lambda group: ["odometry"])
+    text = recommend(["sensors=hokuyo", "people.n=6"]).text
+    assert "people.n 6 (there 0" in text
+
+
 def test_wrong_overrides_are_refused():
     with pytest.raises(InputError, match="leave the estimator out"):
         recommend(["estimator=mcl"])
