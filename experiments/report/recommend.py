@@ -22,7 +22,10 @@ from sim.errors import require
 
 Setting = dict[str, Any]
 _ERROR = "answer_ate_rmse_m"
-_ALWAYS = ("world", "robot.kr", "robot.kl", "route.distance_m", "people.n")  # always compared
+_ALWAYS = (  # compared for every estimator
+    "world", "world.changed_share", "people.n", "team.size", "prior.start", "robot.kr", "robot.kl",
+    "route.distance_m",
+)  # fmt: skip
 _WITHOUT_IDS = "estimator.association=mahalanobis"
 _MOST_CHANGES, _MOST_SHOWN, _MOST_TRIED = 6, 8, 4
 _TUNED = "_tuned"
@@ -132,6 +135,8 @@ def recommend(
     lines, shown = [f"Fits: {', '.join(here)}."], set[str]()
     if absent:
         lines.append(f"Not installed, but would fit: {', '.join(absent)}.")
+    if unread := _unread(fits):
+        lines.append(f"None of these reads {' or '.join(unread)}.")
     lines.append("")
     if any(each.associates for each in fits):
         lines += [f"Landmarks without ids need {_WITHOUT_IDS}; the errors below are with ids.", ""]
@@ -351,7 +356,9 @@ def _compared(candidate: Candidate) -> list[str]:
 def _changes(asked: Setting, row: Judged, keys: Iterable[str]) -> dict[str, float]:
     """Keys in which a row's setting differs, and how far: in decades, or 1."""
     swept = [key for key in row.setting if key.startswith("estimator.")]
-    pairs = {key: (asked.get(key), row.setting.get(key)) for key in [*keys, *swept]}
+    pairs = {  # 0 is none of it
+        key: (asked.get(key) or None, row.setting.get(key) or None) for key in [*keys, *swept]
+    }
     return {key: _apart(*pair) for key, pair in pairs.items() if pair[0] != pair[1]}
 
 
@@ -369,6 +376,14 @@ def _needed(others: Iterable[Candidate]) -> list[str]:
     for each in others:
         lack.setdefault(" and ".join(each.missing), []).append(each.name)
     return [f"Needs {words}: {', '.join(names)}." for words, names in lack.items()]
+
+
+def _unread(fits: Sequence[Candidate]) -> list[str]:
+    """Sensors, beside the wheels, that no estimator reads."""
+    read = {name for each in fits for name in each.experiment.sensors_needed()}
+    read |= {str(v) for each in fits for v in each.experiment.options_of("estimator").values()}
+    keys = {key.split(".")[1] for key in _setting(fits[0].experiment) if key.startswith("sensors.")}
+    return sorted(keys - read - {"encoder"})
 
 
 def _to_be_sure(

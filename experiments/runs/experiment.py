@@ -242,6 +242,8 @@ class Experiment(Objects):
             words.append("a map (prior.map=world)")
         if self.config["prior"]["start"] == "global" and "map" not in needs:
             words.append("a known start (prior.start=tracking)")  # only a map tells where it is
+        if self.team is not None and not self._takes_teams():
+            words.append("a single robot")
         return words
 
     def _check_needs(self) -> None:
@@ -282,14 +284,17 @@ class Experiment(Objects):
                 "occupancy grid",
             )
 
+    def _takes_teams(self) -> bool:
+        kind = find(self.config["estimator"].get("_target_"), "estimator")
+        return not inspect.isclass(kind) or hasattr(kind, "step_team")
+
     def _check_team(self) -> None:
         """Check each robot of a team, and what only a robot alone can have."""
         team = self.team
         if team is None:
             return
-        kind = find(self.config["estimator"].get("_target_"), "estimator")
         require(
-            not inspect.isclass(kind) or hasattr(kind, "step_team"),
+            self._takes_teams(),
             f"estimator={self.estimator_name} localizes one robot; a team takes {OF_TEAMS}",
         )
         if self.option("robots") is not None and not self.from_file:

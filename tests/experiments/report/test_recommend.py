@@ -84,6 +84,21 @@ def test_people_count_in_the_distance(monkeypatch):
     assert "people.n 6 (there 0" in text
 
 
+def test_what_is_read_by_none_and_what_takes_no_team_is_said(monkeypatch):
+    monkeypatch.setattr(paths, "option_names", lambda group: ["ekf_slam", "fixed_lag", "odometry"])
+    assert "None of these reads gyroscope." in recommend(["sensors=gyroscope"]).text
+    text = recommend(["study=teams", "team.size=3"]).text
+    assert "Fits: ekf_slam." in text
+    assert "Needs a single robot: fixed_lag, odometry." in text
+    assert "None of these reads" not in text
+
+
+def test_an_unknown_start_counts_in_the_distance(monkeypatch):
+    monkeypatch.setattr(paths, "option_names", lambda group: ["mcl"])
+    text = recommend(["sensors=hokuyo", "prior.map=world", "prior.start=global"]).text
+    assert "prior.start global (there tracking" in text
+
+
 def test_wrong_overrides_are_refused():
     with pytest.raises(InputError, match="leave the estimator out"):
         recommend(["estimator=mcl"])
