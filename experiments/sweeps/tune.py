@@ -380,13 +380,17 @@ def _done() -> tuple[Any, Any]:
 
 
 def _mean_log_error(trial: Any, problem: _Problem) -> float:
-    """Mean log error of a trial's values; the trial is pruned when it is clearly not the best."""
+    """Mean log error of a trial's values; the trial is pruned when it is clearly not the best.
+
+    The default is not: the others' errors are told as shares of its own.
+    """
     values = {name: _suggested(trial, name, allowed) for name, allowed in problem.ranges.items()}
     logs = []
     for i, experiment in enumerate(problem.drives):
         logs.append(math.log(error_m(with_values(experiment, values))))
         trial.report(logs[-1], i)
-        if i + 1 < len(problem.drives) and trial.should_prune():
+        last = i + 1 == len(problem.drives)
+        if not last and values != problem.default and trial.should_prune():
             raise _optuna().TrialPruned
     return float(np.mean(logs))
 

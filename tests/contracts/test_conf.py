@@ -123,5 +123,5 @@ def test_what_a_file_does_not_state_is_the_default_of_what_it_names(tmp_path):
 def test_an_option_of_a_folder_is_called_by_its_last_part():
     experiment = Experiment.compose(["estimator=peers/kiss_icp_tuned"])
     assert experiment.estimator_name == "kiss_icp_tuned"
-    assert experiment.options_of("estimator")["voxel_size_m"] == 0.2
+    assert experiment.options_of("estimator")["voxel_size_m"] == 0.1
     assert find_option("estimator", "kiss_icp") == "peers/kiss_icp"

@@ -122,6 +122,33 @@ def test_the_default_wins_where_nothing_is_better(study, monkeypatch):
     assert tuned.gain.value == 1.0
 
 
+def test_the_default_is_never_given_up(study):
+    write, _ = study
+    plan = tuning.tuning_of("toy", write())
+    problem = tuning._problem("toy", "odometry", plan, write())
+
+    class Losing:
+        def __init__(self, values):
+            self.values = values
+
+        def should_prune(self):
+            return True
+
+        def report(self, value, step):
+            pass
+
+        def suggest_float(self, name, low, high, log):
+            return self.values[name]
+
+        def suggest_categorical(self, name, choices):
+            return self.values[name]
+
+    assert math.isfinite(tuning._mean_log_error(Losing(problem.default), problem))
+    with pytest.raises(Exception, match="") as given_up:
+        tuning._mean_log_error(Losing({**problem.default, "integration": "euler"}), problem)
+    assert given_up.typename == "TrialPruned"
+
+
 def test_a_failed_run_counts(monkeypatch):
     rows = [{"status": "failed"}, {"status": "ok", "ate_rmse_m": math.nan}]
     rows += [{"status": "ok", "ate_rmse_m": 4.0, "revised_ate_rmse_m": 0.5}]
