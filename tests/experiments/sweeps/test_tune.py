@@ -144,9 +144,8 @@ def test_the_default_is_never_given_up(study):
             return self.values[name]
 
     assert math.isfinite(tuning._mean_log_error(Losing(problem.default), problem))
-    with pytest.raises(Exception, match="") as given_up:
+    with pytest.raises(pytest.importorskip("optuna").TrialPruned):
         tuning._mean_log_error(Losing({**problem.default, "integration": "euler"}), problem)
-    assert given_up.typename == "TrialPruned"
 
 
 def test_a_failed_run_counts(monkeypatch):
