@@ -91,9 +91,12 @@ def _say_next(experiment: Experiment, line: CommandLine) -> None:
     options = config_dir_option(line.config_dir)
     others = [word for word in line.overrides if word.lstrip("+").partition("=")[0] != "seed"]
     said = shlex.join(["estima", "run", *others, *options])
-    show(f"Next: intervals over ten drives: {said} -m 'seed=range(0,10)'")
-    if experiment.command is not None:  # `view` cannot be told it
-        return
-    drive = shlex.join(["estima", "record", "-o", "run.npz", *line.overrides, *options])
-    view = ["estima", "view", "run.npz", "-e", experiment.estimator_name, *options]
-    show(f"      as it moves: {drive} && {shlex.join([*view, '-o', 'run.html'])}")
+    lines = []
+    if not experiment.has_own_map:  # another seed is another world
+        lines.append(f"intervals over ten drives: {said} -m 'seed=range(0,10)'")
+    if experiment.command is None:  # `view` cannot be told it
+        drive = shlex.join(["estima", "record", "-o", "run.npz", *line.overrides, *options])
+        view = ["estima", "view", "run.npz", "-e", experiment.estimator_name, *options]
+        lines.append(f"as it moves: {drive} && {shlex.join([*view, '-o', 'run.html'])}")
+    for number, text in enumerate(lines):
+        show(("      " if number else "Next: ") + text)

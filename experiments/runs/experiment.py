@@ -114,6 +114,11 @@ class Experiment(Objects):
         return self.config["recording"] is not None
 
     @property
+    def has_own_map(self) -> bool:
+        """Whether the prior's map is a file, which fits one world alone."""
+        return is_grid_file(self.config["prior"]["map"])
+
+    @property
     def is_read(self) -> bool:
         """Whether its recording is read from a file."""
         return isinstance(self.config["recording"], str)
