@@ -133,11 +133,13 @@ def recommend(
 
     with progress("comparing estimators", 1.0) as on_progress:
         advice = recommend(overrides or [], on_progress)
-    show(
-        f"{advice.text}\n\nTo be sure, run the best in your own setting:\n"
-        f"  {shlex.join(['estima', 'run', '-m', *advice.sweep])}\n"
-        f"  estima table {SURE} --times"
-    )
+    show(advice.text)
+    if advice.sweep:
+        show(
+            "\nTo be sure, run the best in your own setting:\n"
+            f"  {shlex.join(['estima', 'run', '-m', *advice.sweep])}\n"
+            f"  estima table {SURE} --times"
+        )
 
 
 def view(

@@ -91,7 +91,7 @@ class Candidate:
 
 
 class Advice(NamedTuple):
-    """What to tell, and the arguments of the sweep that settles it, which is named `SURE`."""
+    """What to tell, and the arguments of the sweep `SURE` that settles it; none if nothing fits."""
 
     text: str
     sweep: list[str]
@@ -132,7 +132,7 @@ def recommend(
     nearest = sorted(_by_table(fits, rows), key=lambda found: found.apart)
     here = [each.option for each in fits if each.installed]
     absent = [each.option for each in fits if not each.installed]
-    lines, shown = [f"Fits: {', '.join(here)}."], set[str]()
+    lines, shown = [f"Fits: {', '.join(here)}." if here else "None fits."], set[str]()
     if absent:
         lines.append(f"Not installed, but would fit: {', '.join(absent)}.")
     if unread := _unread(fits):
@@ -382,14 +382,15 @@ def _unread(fits: Sequence[Candidate]) -> list[str]:
     """Sensors, beside the wheels, that no estimator reads."""
     read = {name for each in fits for name in each.experiment.sensors_needed()}
     read |= {str(v) for each in fits for v in each.experiment.options_of("estimator").values()}
-    keys = {key.split(".")[1] for key in _setting(fits[0].experiment) if key.startswith("sensors.")}
-    return sorted(keys - read - {"encoder"})
+    settings = (_setting(each.experiment) for each in fits[:1])  # all have the same sensors
+    there = {key.split(".")[1] for flat in settings for key in flat if key.startswith("sensors.")}
+    return sorted(there - read - {"encoder"})
 
 
 def _to_be_sure(
     overrides: Sequence[str], fits: Sequence[Candidate], nearest: Sequence[Nearest]
 ) -> list[str]:
-    """Arguments of a sweep of the best ones, on seeds that nothing was tuned on."""
+    """Arguments of a sweep of the best, on seeds that nothing was tuned on; none if nothing fits."""
     associating = any(each.associates for each in fits)
     able = [each for each in fits if each.installed and each.associates >= associating]
     options = {each.name: each.option for each in able}
@@ -398,6 +399,8 @@ def _to_be_sure(
     for name in [*ranked, *options]:
         best.setdefault(name.removesuffix(_TUNED), options[name])
     tried = [*best.values()][:_MOST_TRIED]
+    if not tried:
+        return []
     exact = any(override.startswith("simulation.") for override in overrides)
     words = [*overrides, *([] if exact else ["simulation.rays=exact"])]
     words += [_WITHOUT_IDS] * associating

@@ -93,6 +93,14 @@ def test_what_is_read_by_none_and_what_takes_no_team_is_said(monkeypatch):
     assert "None of these reads" not in text
 
 
+def test_where_nothing_fits_that_is_said(monkeypatch):
+    monkeypatch.setattr(paths, "option_names", lambda group: ["odometry"])
+    text, sweep = recommend(["prior.start=global"])
+    assert "None fits." in text
+    assert "Needs a known start (prior.start=tracking): odometry." in text
+    assert sweep == []
+
+
 def test_an_unknown_start_counts_in_the_distance(monkeypatch):
     monkeypatch.setattr(paths, "option_names", lambda group: ["mcl"])
     text = recommend(["sensors=hokuyo", "prior.map=world", "prior.start=global"]).text
