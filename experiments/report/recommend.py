@@ -390,7 +390,7 @@ def _unread(fits: Sequence[Candidate]) -> list[str]:
 def _to_be_sure(
     overrides: Sequence[str], fits: Sequence[Candidate], nearest: Sequence[Nearest]
 ) -> list[str]:
-    """Arguments of a sweep of the best, on seeds that nothing was tuned on; none if nothing fits."""
+    """Arguments of a sweep of the best, on seeds that none was tuned on; none if nothing fits."""
     associating = any(each.associates for each in fits)
     able = [each for each in fits if each.installed and each.associates >= associating]
     options = {each.name: each.option for each in able}
