@@ -258,25 +258,18 @@ def mx2(particles: pd.DataFrame, times: pd.DataFrame) -> Iterator[Claim]:
             all_equal = errors.max(axis=1) < _EQUAL * errors.min(axis=1)
             yield own_design("MX2", f"one route ({PLACES[name]})", all_equal)
     for name, part in times.groupby("geometry", sort=False):
-        counts = part.groupby("particles")["time_s"]
         shares = {_PAPERS: part["time_s"] / part["paper_s"]}
         if name.startswith("oxford"):
             shares[_BETWEEN] = part["time_s"] / BETWEEN_NODES_S
         for what, share in shares.items():
             label = f"time a node over {what}, the largest, {NAMES[name]}"
-            each = share.groupby(part["particles"])
-            most = each.median().idxmax()
-            found = Interval(
-                *(float(getattr(each, end)()[most]) for end in ("median", "min", "max"))
-            )
+            most = share.groupby(part["particles"]).median().idxmax()
+            found = _middle_and_ends(share[part["particles"] == most])
             about = Subject("MX2", "time", over=what, place=NAMES[name])
             yield judge_bounds(about, label, found, at_most=0.1)
-        (low, fewest), *_, (most, largest) = ((k, v.to_numpy()) for k, v in counts)
-        grown = Interval(
-            float(np.median(largest) / np.median(fewest)),
-            float(largest.min() / fewest.max()),
-            float(largest.max() / fewest.min()),
-        )
+        turns = part.pivot(index="repeat", columns="particles", values="time_s")
+        low, most = turns.columns.min(), turns.columns.max()
+        grown = _middle_and_ends(turns[most] / turns[low])
         label = f"time a node with the most particles over that with the fewest, {NAMES[name]}"
         about = Subject("MX2", "time", over="the fewest", place=NAMES[name])
         claim = judge_bounds(about, label, grown, at_least=1.0, criterion="above 1")
@@ -284,19 +277,20 @@ def mx2(particles: pd.DataFrame, times: pd.DataFrame) -> Iterator[Claim]:
     yield from _oxford_slower(times)
 
 
+def _middle_and_ends(found: pd.Series) -> Interval:
+    """The median of repeats, from the min to the max."""
+    return Interval(float(found.median()), float(found.min()), float(found.max()))
+
+
 def _oxford_slower(times: pd.DataFrame) -> Iterator[Claim]:
     """Judge that Oxford, which has more nodes, takes longer, with as many particles a node."""
     counts = times.groupby("geometry")["particles"]
     per_node = (times["particles"] / counts.transform("min")).rename("per_node")  # of the fewest
-    each = times.groupby(["geometry", per_node])["time_s"].agg(["median", "min", "max"])
+    turns = times.assign(per_node=per_node).set_index(["geometry", "per_node", "repeat"])["time_s"]
     for oxford in {name for name in times["geometry"] if name.startswith("oxford")}:
-        ours, other = each.loc[oxford], each.loc["umh"]
-        least = (ours["median"] / other["median"]).idxmin()
-        found = Interval(
-            float(ours["median"][least] / other["median"][least]),
-            float(ours["min"][least] / other["max"][least]),
-            float(ours["max"][least] / other["min"][least]),
-        )
+        ratios = turns[oxford] / turns["umh"]
+        least = ratios.groupby("per_node").median().idxmin()
+        found = _middle_and_ends(ratios[least])
         label = f"time a node over that of UMH, the smallest, {NAMES[oxford]}"
         about = Subject("MX2", "time", over="UMH", place=NAMES[oxford])
         yield judge_bounds(about, label, found, at_least=1.0, criterion="above 1")

@@ -255,13 +255,17 @@ def _rows(
 
 
 def times(n_repeats: int, seed: int) -> pd.DataFrame:
-    """Table 2: time per node on one core, timed repeatedly after the other jobs have ended."""
-    rows = []
-    for name in sorted(headlines(routes())):
-        experiment = make_case(name, seed).experiment
-        for count, paper_s in topological.PAPER_S[name.removesuffix("_real")].items():
-            found = [topological.node_s(experiment, count) for _ in range(n_repeats)]
-            rows += [(name, count, repeat, time_s, paper_s) for repeat, time_s in enumerate(found)]
+    """Table 2: time per node on one core, timed repeatedly after the other jobs have ended.
+
+    Routes and numbers of particles take turns, so that a machine that slows down slows all alike.
+    """
+    experiments = {name: make_case(name, seed).experiment for name in sorted(headlines(routes()))}
+    rows = [
+        (name, count, repeat, topological.node_s(experiment, count), paper_s)
+        for repeat in range(n_repeats)
+        for name, experiment in experiments.items()
+        for count, paper_s in topological.PAPER_S[name.removesuffix("_real")].items()
+    ]
     return pd.DataFrame(rows, columns=["geometry", "particles", "repeat", "time_s", "paper_s"])
 
 

@@ -315,8 +315,25 @@ def test_intervals_of_two_one_sided_tests_are_named():
         [(s, n, 1.0 + 0.01 * s) for s in range(20) for n in (2, 4, 6, 8)],
         columns=["seed", "per_node", "error_m"],
     ).assign(geometry="umh")
-    no_times = pd.DataFrame({"geometry": [], "particles": [], "time_s": []})
+    no_times = pd.DataFrame({"geometry": [], "particles": [], "repeat": [], "time_s": []})
     tested = list(maximo2024.mx2(worlds, no_times))
     tested = [claim for claim in tested if claim.about.quantity == "error"]
     assert tested
     assert all("(90 % interval)" in claim.statistic for claim in tested)
+
+
+def test_a_machine_that_slows_down_turns_no_time_of_mx2():
+    each = [
+        ("umh", 272, 1.0),
+        ("umh", 544, 1.1),
+        ("oxford_real", 794, 1.3),
+        ("oxford_real", 1588, 1.5),
+    ]
+    slower = [1.0, 1.0, 3.0, 3.0, 5.0]  # a turn takes so many times as long
+    times = pd.DataFrame(
+        [(g, n, turn, 1e-4 * t * by, 0.2) for turn, by in enumerate(slower) for g, n, t in each],
+        columns=["geometry", "particles", "repeat", "time_s", "paper_s"],
+    )
+    (claim,) = maximo2024._oxford_slower(times)
+    assert claim.found.value == pytest.approx(1.3)
+    assert claim.found.low == pytest.approx(1.3) == claim.found.high
