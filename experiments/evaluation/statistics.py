@@ -39,6 +39,13 @@ def mean_interval(values: ArrayLike, level: float = 0.95) -> Interval:
     return Interval(mean, mean - half, mean + half)
 
 
+def median_interval(values: ArrayLike) -> Interval:
+    """Median of values (N,), its distribution-free 95 % interval; without bounds below six."""
+    sample = np.asarray(values, float)
+    found = scipy.stats.quantile_test(sample, p=0.5).confidence_interval(0.95)
+    return Interval(float(np.median(sample)), float(found.low), float(found.high))
+
+
 def share_interval(hits: int, trials: int) -> Interval:
     """Share of hits with its Clopper-Pearson interval; without bounds for no trial."""
     if trials == 0:

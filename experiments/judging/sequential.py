@@ -165,6 +165,7 @@ def run_worlds(
     profile: Profile,
     rows_of: Callable[[Sequence[int]], Mapping[str, pd.DataFrame]],
     judge: Callable[[Mapping[str, pd.DataFrame]], Sequence[Claim]],
+    on_progress: Callable[[float], None] = lambda _: None,
 ) -> dict[str, pd.DataFrame]:
     """Run the worlds of claims that share tables until all are decided by their designs.
 
@@ -174,6 +175,8 @@ def run_worlds(
     ----------
     rows_of
         Gives the tables of the worlds with these seeds.
+    on_progress
+        Called after each look with its share of the most worlds that may be run.
     """
     given = [each for name, each in designs(study).items() if name in claims]
     looks = sorted({n for each in given for n in each.looks})
@@ -186,6 +189,7 @@ def run_worlds(
             both = [tables[name], new] if name in tables else [new]
             tables[name] = pd.concat(both, ignore_index=True)
         done = n
+        on_progress(done / looks[-1])
         return tables
 
     run_until_decided(looks, run_to, judge)

@@ -84,6 +84,7 @@ _RUN = {
     "rays": "simulation.rays",
     "method": "method",
 }
+_ENDS = (0.55, 0.9, 0.91, 0.93, 0.95)  # progress after the fixed jobs, and after each design
 _BELIEF = {"seed": "seed", "belief": "belief"}
 _ADJUSTED = {
     name: f"estimator.{name}" for name in ("acceleration_noise", "turn_noise")
@@ -101,13 +102,15 @@ def run(profile: Profile, out: Results, on_progress: Progress) -> None:
     fixed, regions = _jobs(profile, out), region_jobs("decristoforis2020", region_run, profile)
     calls = [(function, *given) for _, function, given in fixed] + regions
     costs = [cost for cost, *_ in fixed] + len(regions) * [0.1]
-    whole = tables_of(operator.call, calls, lambda share: on_progress(0.6 * share), costs)
-    for claims, jobs_of, judge in _designed(profile):
-        made = run_worlds("decristoforis2020", claims, profile, partial(_block, jobs_of), judge)
+    begun = _ENDS[0]
+    whole = tables_of(operator.call, calls, _part_of(on_progress, 0.0, begun), costs)
+    for (claims, jobs_of, judge), end in zip(_designed(profile), _ENDS[1:], strict=True):
+        block, progress = partial(_block, jobs_of), _part_of(on_progress, begun, end)
+        made = run_worlds("decristoforis2020", claims, profile, block, judge, progress)
+        begun = end
         for name, table in made.items():
             both = [whole[name], table] if name in whole else [table]
             whole[name] = pd.concat(both, ignore_index=True)
-    on_progress(0.95)
     whole["boxes"] = _boxes(judged_runs(whole.pop("errors")))
     if "log_errors" in whole:
         whole["log_boxes"] = _boxes(whole.pop("log_errors"))
@@ -117,6 +120,10 @@ def run(profile: Profile, out: Results, on_progress: Progress) -> None:
     whole["covariances"] = whole["covariances"].sort_values(["metric", "method", "place", "seed"])
     out.write_tables(**whole)
     on_progress(1.0)
+
+
+def _part_of(on_progress: Progress, begun: float, end: float) -> Progress:
+    return lambda share: on_progress(begun + (end - begun) * share)
 
 
 def _designed(profile: Profile) -> list[tuple[list[str], JobsOf, Judge]]:

@@ -19,6 +19,7 @@ from experiments.evaluation.statistics import (
     log_log_slope,
     log_ratio_interval,
     mean_interval,
+    median_interval,
     page_trend_p,
 )
 from experiments.judging.claim import (
@@ -418,12 +419,6 @@ def gi8(cost: pd.DataFrame) -> Iterator[Claim]:
         label = f"time of a step, contiguous over shared, at N = {n}"
         about = Subject("GI8", "contiguous over shared", size=int(n))
         yield shown(about, label, Interval.exact(float(ratio)))
-
-
-def median_interval(values: Array) -> Interval:
-    """Median with its distribution-free interval of at least 95 %."""
-    found = scipy.stats.quantile_test(values, p=0.5).confidence_interval(0.95)
-    return Interval(float(np.median(values)), float(found.low), float(found.high))
 
 
 def _printed(name: str, noise: str) -> bool:

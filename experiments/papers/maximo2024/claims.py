@@ -16,6 +16,7 @@ from experiments.evaluation.statistics import (
     Interval,
     log_ratio_interval,
     mean_interval,
+    median_interval,
     share_interval,
 )
 from experiments.judging.claim import (
@@ -264,22 +265,17 @@ def mx2(particles: pd.DataFrame, times: pd.DataFrame) -> Iterator[Claim]:
         for what, share in shares.items():
             label = f"time a node over {what}, the largest, {NAMES[name]}"
             most = share.groupby(part["particles"]).median().idxmax()
-            found = _middle_and_ends(share[part["particles"] == most])
+            found = median_interval(share[part["particles"] == most])
             about = Subject("MX2", "time", over=what, place=NAMES[name])
             yield judge_bounds(about, label, found, at_most=0.1)
         turns = part.pivot(index="repeat", columns="particles", values="time_s")
         low, most = turns.columns.min(), turns.columns.max()
-        grown = _middle_and_ends(turns[most] / turns[low])
+        grown = median_interval(turns[most] / turns[low])
         label = f"time a node with the most particles over that with the fewest, {NAMES[name]}"
         about = Subject("MX2", "time", over="the fewest", place=NAMES[name])
         claim = judge_bounds(about, label, grown, at_least=1.0, criterion="above 1")
         yield with_remark(claim, f"{most} particles over {low}")
     yield from _oxford_slower(times)
-
-
-def _middle_and_ends(found: pd.Series) -> Interval:
-    """The median of repeats, from the min to the max."""
-    return Interval(float(found.median()), float(found.min()), float(found.max()))
 
 
 def _oxford_slower(times: pd.DataFrame) -> Iterator[Claim]:
@@ -290,7 +286,7 @@ def _oxford_slower(times: pd.DataFrame) -> Iterator[Claim]:
     for oxford in {name for name in times["geometry"] if name.startswith("oxford")}:
         ratios = turns[oxford] / turns["umh"]
         least = ratios.groupby("per_node").median().idxmin()
-        found = _middle_and_ends(ratios[least])
+        found = median_interval(ratios[least])
         label = f"time a node over that of UMH, the smallest, {NAMES[oxford]}"
         about = Subject("MX2", "time", over="UMH", place=NAMES[oxford])
         yield judge_bounds(about, label, found, at_least=1.0, criterion="above 1")

@@ -43,8 +43,10 @@ def run(profile: Profile, out: Results, on_progress: Progress) -> None:
     profile
         `quick`: two worlds.
     """
-    tables = run_worlds("exploration", ["GI10"], profile, _worlds, lambda t: list(gi10(t["runs"])))
-    on_progress(0.95)
+    tables = run_worlds(
+        *("exploration", ["GI10"], profile, _worlds, lambda t: list(gi10(t["runs"]))),
+        on_progress=lambda share: on_progress(0.95 * share),
+    )
     out.write_tables(**tables)
     for strategy in (settings.BASE, settings.BOTH):
         team = compose_experiment(FIRST_SEED[profile], strategy).recordings()

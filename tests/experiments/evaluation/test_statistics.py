@@ -119,3 +119,9 @@ def test_ratios_without_a_logarithm_are_refused(first):
     for function in (statistics.log_ratio_interval, statistics.wilcoxon_p):
         with pytest.raises(InputError, match=r"logarithm|lengths"):
             function(first, [1.0, 1.0])
+
+
+def test_interval_of_a_median():
+    found = statistics.median_interval(values := np.arange(1.0, 21.0))
+    assert (found.value, found.low, found.high) == (10.5, 6.0, 15.0)
+    assert np.isnan(statistics.median_interval(values[:4]).low)

@@ -273,10 +273,3 @@ def test_gi8_reads_exponents():
     assert "grows as N^0.10 with maps that particles share until one writes" in said.sentence
     swapped = table.replace({"maps": {"contiguous": "shared", "shared": "contiguous"}})
     assert headlines(judge.gi8(swapped)) == ["not_reproduced", "not_reproduced"]
-
-
-def test_interval_of_a_median():
-    values = np.arange(1.0, 21.0)
-    found = judge.median_interval(values)
-    assert (found.value, found.low, found.high) == (10.5, 6.0, 15.0)
-    assert np.isnan(judge.median_interval(values[:4]).low)

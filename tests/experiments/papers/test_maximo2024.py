@@ -114,18 +114,19 @@ def test_mx2_wants_equal_errors_and_rising_times():
 
 
 def node_times():
-    """Two timings of a node by two numbers of particles, on each route."""
-    seconds = {"oxford": [1.0e-4, 2.0e-4, 1.1e-4, 2.2e-4], "umh": [0.5e-4, 1.0e-4, 0.55e-4, 1.1e-4]}
+    """Six timings of a node by two numbers of particles, on each route; one turn is slower."""
+    slower = [1.0, 1.1, 1.0, 1.0, 1.0, 1.0]
+    seconds = {"oxford": [1.0e-4, 2.0e-4], "umh": [0.5e-4, 1.0e-4]}
     counts = {"oxford": [794, 1588], "umh": [272, 544]}
     paper_s = {"oxford": [0.26, 0.36], "umh": [0.09, 0.12]}
     return pd.concat(
         pd.DataFrame(
             {
                 "geometry": name,
-                "particles": counts[name] * 2,
-                "repeat": [0, 0, 1, 1],
-                "time_s": seconds[name],
-                "paper_s": paper_s[name] * 2,
+                "particles": counts[name] * 6,
+                "repeat": np.arange(12) // 2,
+                "time_s": np.outer(slower, seconds[name]).ravel(),
+                "paper_s": paper_s[name] * 6,
             }
         )
         for name in seconds
