@@ -345,6 +345,8 @@ def beliefs(table: pd.DataFrame) -> Figure:
     )
     axes[0].invert_yaxis()
     axes[1].set(xscale="log", xlabel="NEES / 3")
+    for ax in axes:
+        plain_log(ax.xaxis)
     page.suptitle(
         "our fusion; dot: a recording; green: consistent\nblack: geometric mean, 95 % interval",
         size=9,
